@@ -1,0 +1,20 @@
+"""Baseline "CNN only": the U-Net sees nothing but the G-buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule
+
+
+class CNN(RenderingModule):
+    """Sec. "Baselines" (1)."""
+
+    feature_channels = GBUFFER_CHANNELS
+    inputs = GBUFFER
+    stages = ("gbuffer",)
+
+    def features(self, batch: Batch, transported: Any = None) -> Tensor:
+        return self.gbuffer(batch)

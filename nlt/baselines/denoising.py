@@ -1,0 +1,77 @@
+"""Baseline "Denoising": the U-Net sees a random subset of the pixels, path traced, and the G-buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, log_exposed
+
+
+def _hash(x: Tensor) -> Tensor:
+    """A bijective mix of 32-bit integers, held in int64: the same numbers on every device."""
+    x = x & 0xFFFFFFFF
+    for _ in range(2):
+        x = ((x ^ (x >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    return x ^ (x >> 16)
+
+
+def pixel_mask(seeds: Tensor, height: int, width: int, one_in: int) -> Tensor:
+    """A uniformly random subset of exactly round(height * width / one_in) pixels for each seed.
+
+    `seeds` (B,) int64; returns (B, 1, height, width) bool, which depends on nothing but the arguments.
+    """
+    pixels = height * width
+    # Bijective, so no two pixels of a sample draw the same number.
+    keys = _hash(_hash(torch.arange(pixels, device=seeds.device)) + _hash(seeds)[:, None])
+    chosen = keys.argsort(dim=1)[:, : round(pixels / one_in)]
+    mask = torch.zeros_like(keys, dtype=torch.bool).scatter_(1, chosen, True)
+    return mask.view(-1, 1, height, width)
+
+
+class SparseDenoising(RenderingModule):
+    """Sec. "Baselines" (2), similar to Lehtinen et al. 2018: 4 spp in 1 of `one_in` pixels, the rest 0."""
+
+    architecture = (*RenderingModule.architecture, "one_in", "gbuffer")
+
+    def __init__(self, one_in: int = 1, gbuffer: bool = True, **kwargs: Any) -> None:
+        """The base class takes the keyword arguments.
+
+        Args:
+            one_in: one in how many pixels is path traced.
+            gbuffer: feed the G-buffer too.
+        """
+        super().__init__(**kwargs)
+
+    @property
+    def feature_channels(self) -> int:
+        return 4 + GBUFFER_CHANNELS * self.hparams["gbuffer"]  # radiance and mask
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return (*(GBUFFER if self.hparams["gbuffer"] else ()), "noisy_input")
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        return (*(("gbuffer",) if self.hparams["gbuffer"] else ()), "path_tracing")
+
+    @property
+    def pixel_fraction(self) -> float:
+        return 1 / self.hparams["one_in"]
+
+    def mask(self, batch: Batch, height: int, width: int) -> Tensor:
+        """The pixels to trace (B, 1, height, width): fresh at each training step, else the sample's own."""
+        seeds = _hash(_hash(batch["scene"]) + batch["index"])
+        if self.training:  # a function of the step alone, not of a generator's state: resuming is exact
+            seeds = _hash(_hash(seeds + self.global_step) + self.hparams["seed"])
+        return pixel_mask(seeds, height, width, self.hparams["one_in"])
+
+    def features(self, batch: Batch, transported: Any = None) -> Tensor:
+        mask = self.mask(batch, *batch["noisy_input"].shape[-2:])
+        radiance = log_exposed(batch["noisy_input"], batch["exposure"]).masked_fill(~mask, 0)
+        maps = [radiance, mask.to(radiance.dtype)]
+        if self.hparams["gbuffer"]:
+            maps.append(self.gbuffer(batch))
+        return torch.cat(maps, dim=1)

@@ -1,0 +1,38 @@
+"""Baseline "Feature Projection": learned point features projected as they are, without light transport."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule
+from nlt.models.transport import PointEmbedding
+
+
+class FeatureProjection(RenderingModule):
+    """Sec. "Baselines" (3), similar to Aliev et al. 2019: G-buffer and projected point embeddings."""
+
+    architecture = (*RenderingModule.architecture, "num_scenes", "num_points", "embedding")
+    inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "point_position", "point_visible")))
+    stages = ("gbuffer",)
+
+    def __init__(self, embedding: int = 64, **kwargs: Any) -> None:
+        """The base class takes the keyword arguments.
+
+        Args:
+            embedding: channels of the learned feature of each point.
+        """
+        super().__init__(**kwargs)
+        hparams = self.hparams
+        self.embedding = PointEmbedding(hparams["num_scenes"], hparams["num_points"], embedding)
+
+    @property
+    def feature_channels(self) -> int:
+        return GBUFFER_CHANNELS + self.hparams["embedding"]
+
+    def features(self, batch: Batch, transported: Any = None) -> Tensor:
+        features = self.embedding(batch["scene"])
+        projected = self.project(batch, features, batch["point_position"], batch["point_visible"])
+        return torch.cat([self.gbuffer(batch), projected], dim=1)

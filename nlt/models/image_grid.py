@@ -1,0 +1,58 @@
+"""TensorBoard images during training: noisy input, prediction, reference and error of a few samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from nlt.metrics.display import display
+
+
+class ImageGrid(L.Callback):
+    """Every `every_n_epochs` epochs adds the image "val/images": a row each for the first `images` samples.
+
+    Columns, as displayed: noisy (where the batch has it), prediction, reference, absolute difference of the
+    last two. Does nothing without a TensorBoard logger and on ranks other than 0.
+    """
+
+    def __init__(self, every_n_epochs: int = 5, images: int = 4) -> None:
+        self.every_n_epochs = every_n_epochs
+        self.images = images
+        self._rows: list[Tensor] = []
+
+    def _active(self, trainer: L.Trainer) -> bool:
+        due = trainer.current_epoch % self.every_n_epochs == 0 and not trainer.sanity_checking
+        return due and trainer.is_global_zero
+
+    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._rows = []
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: dict[str, Tensor],
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        if not self._active(trainer) or len(self._rows) >= self.images:
+            return
+        reference = (batch["reference_a"] + batch["reference_b"]) / 2
+        columns = [outputs, reference, (outputs - reference).abs()]
+        if "noisy" in batch:
+            columns.insert(0, batch["noisy"])
+        rows = torch.cat([display(x, batch["exposure"]) for x in columns], dim=-1)
+        self._rows += rows[: self.images - len(self._rows)].cpu()
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not self._active(trainer) or not self._rows:
+            return
+        grid = torch.cat(self._rows, dim=-2)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_image("val/images", grid, trainer.global_step)

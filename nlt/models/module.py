@@ -1,0 +1,226 @@
+"""What all methods share: U-Net, loss, optimiser, logging, metrics; a method says what feeds the U-Net."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import ExponentialLR
+
+from nlt.errors import UserError
+from nlt.metrics.display import expose
+from nlt.metrics.image_metrics import ImageMetrics
+from nlt.models import losses
+from nlt.models.projection import project
+from nlt.models.unet import UNet
+
+Batch = dict[str, Tensor]
+
+# The names in a batch that the two shared inputs read.
+GBUFFER = ("depth", "normal", "albedo", "view_direction")
+PROJECTION = ("depth", "camera_matrix", "world_to_view")
+
+GBUFFER_CHANNELS = 10
+
+
+def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
+    """log(1 + exposure * radiance), of (B, ...) and (B,).
+
+    Network inputs of high dynamic range go through this: a lamp or a firefly is orders of magnitude above
+    the rest, and fed linearly would swamp every feature it is mixed with.
+    """
+    return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
+
+
+class RenderingModule(L.LightningModule):
+    """Base of all methods. A subclass gives `feature_channels`, `inputs`, `stages` and `features`.
+
+    A frame is three steps, which can be timed apart: `transport` (3D), `features` (projection, and what else
+    feeds the U-Net) and `synthesize` (2D). A batch is a dict by the names in `nlt.data.sample`; `exposure`,
+    `scene` and `index` are in every batch.
+    """
+
+    # Hyperparameters that a checkpoint must share to be loaded.
+    architecture: tuple[str, ...] = ("width", "depth")
+
+    def __init__(
+        self,
+        width: int = 64,
+        depth: int = 3,
+        loss: Literal["mse", "relative_mse"] = "mse",
+        learning_rate: float = 5e-4,
+        lr_decay: float = 0.99,
+        num_scenes: int = 1,
+        num_points: int = 1,
+        seed: int = 0,
+    ) -> None:
+        """Defaults are the paper's.
+
+        Args:
+            width: feature maps of the U-Net's first level.
+            depth: number of times the U-Net halves the resolution.
+            loss: a function in nlt.models.losses.
+            learning_rate: of Adam.
+            lr_decay: factor to the learning rate after each epoch.
+            num_scenes: scenes in the dataset; linked from the data.
+            num_points: points per scene; linked from the data.
+            seed: of what a method draws at random in training.
+        """
+        super().__init__()
+        self.save_hyperparameters()
+        self.loss = getattr(losses, loss)
+        # channels_last: the convolutions' fastest layout
+        self.unet = UNet(self.feature_channels, width, depth).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._metrics: list[ImageMetrics] = []  # a list hides it from the parameters and the checkpoint
+
+    # --- what a method is ---
+
+    @property
+    def feature_channels(self) -> int:
+        """Channels of what `features` returns."""
+        raise NotImplementedError
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the batch fields `forward` reads, besides exposure, scene and index."""
+        raise NotImplementedError
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """What has to be rendered for a frame, out of "gbuffer", "photons" and "path_tracing"."""
+        raise NotImplementedError
+
+    @property
+    def pixel_fraction(self) -> float:
+        """Fraction of the pixels that the stage "path_tracing" traces."""
+        return 0.0
+
+    def transport(self, batch: Batch) -> Any:
+        """Light transport: whatever `features` takes up again; None for a method without."""
+        return None
+
+    def features(self, batch: Batch, transported: Any = None) -> Tensor:
+        """The U-Net's input (B, feature_channels, H, W), from the batch and what `transport` returned."""
+        raise NotImplementedError
+
+    # --- what methods share ---
+
+    def gbuffer(self, batch: Batch) -> Tensor:
+        """(B, 10, H, W): depth, normal, albedo and view direction."""
+        return torch.cat([batch[name] for name in GBUFFER], dim=1)
+
+    def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
+        """Eq. (1) with the batch's camera: features (B, N, C) at positions (B, N, 3) to (B, C, H, W)."""
+        return project(
+            features, positions, valid, batch["camera_matrix"], batch["world_to_view"], batch["depth"]
+        )
+
+    def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
+        """Features to linear radiance (B, 3, H, W); the U-Net itself works in exposed radiance."""
+        exposure = batch["exposure"]
+        exposed = self.unet(features.contiguous(memory_format=torch.channels_last))
+        # Out of what layout and, under autocast, precision the convolutions ran in.
+        return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
+
+    def forward(self, batch: Batch) -> Tensor:
+        """The predicted linear radiance (B, 3, H, W), W·sr⁻¹·m⁻²."""
+        return self.synthesize(batch, self.features(batch, self.transport(batch)))
+
+    # --- training and evaluation ---
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        loss = self.loss(self(batch), batch["noisy"], batch["exposure"])
+        if not loss.isfinite():
+            raise UserError(
+                f"train/loss is {loss.item()} at step {self.global_step}, in a batch of scenes "
+                f"{batch['scene'].tolist()}, samples {batch['index'].tolist()}: check these for values that "
+                "are not finite, or lower model.init_args.learning_rate"
+            )
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(batch["scene"]))
+        return loss
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.hparams["learning_rate"])
+        return [optimizer], [ExponentialLR(optimizer, gamma=self.hparams["lr_decay"])]
+
+    def _evaluation_step(self, batch: Batch) -> Tensor:
+        prediction = self(batch)
+        self._metrics[0].update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"])
+        return prediction
+
+    def _log_metrics(self, prefix: str) -> None:
+        self.log_dict({f"{prefix}/{name}": value for name, value in self._metrics[0].compute().items()})
+
+    def on_validation_epoch_start(self) -> None:
+        self._metrics = [ImageMetrics(perceptual=False).to(self.device)]
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        return self._evaluation_step(batch)
+
+    def on_validation_epoch_end(self) -> None:
+        self._log_metrics("val")
+
+    def on_test_epoch_start(self) -> None:
+        self._metrics = [ImageMetrics(perceptual=True).to(self.device)]
+
+    def test_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        return self._evaluation_step(batch)
+
+    def on_test_epoch_end(self) -> None:
+        self._log_metrics("test")
+
+    # --- checkpoints ---
+
+    @classmethod
+    def class_path(cls) -> str:
+        """Import path: the method's identity in a checkpoint."""
+        return f"{cls.__module__}.{cls.__qualname__}"
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        # Not left to "hyper_parameters": load_from_checkpoint overwrites those with its arguments.
+        checkpoint["method"] = self.class_path()
+        checkpoint["architecture"] = {name: self.hparams[name] for name in self.architecture}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Raises UserError if the checkpoint is of another method or another size."""
+        if checkpoint.get("method") != self.class_path():
+            raise _wrong_method(checkpoint, type(self))
+        saved = checkpoint["architecture"]
+        different = [name for name in self.architecture if saved[name] != self.hparams[name]]
+        if different:
+            raise UserError(
+                f"checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, this model "
+                f"{', '.join(f'{name}={self.hparams[name]}' for name in different)}: "
+                "use the configuration the checkpoint was trained with"
+            )
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, *args: Any, **kwargs: Any
+    ) -> RenderingModule:
+        """As Lightning's. `RenderingModule.load_from_checkpoint` takes a checkpoint of any method.
+
+        Raises UserError if the checkpoint is not of `cls`, or `kwargs` change its size.
+        """
+        # Before Lightning builds `cls` from hyperparameters that may be another method's; meta: no tensors.
+        checkpoint = torch.load(checkpoint_path, map_location="meta", weights_only=True)
+        module, _, name = str(checkpoint.get("method", "")).rpartition(".")
+        try:
+            method = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError):
+            method = None
+        if not (isinstance(method, type) and issubclass(method, cls)):
+            raise _wrong_method(checkpoint, cls)
+        return super(RenderingModule, method).load_from_checkpoint(checkpoint_path, *args, **kwargs)
+
+
+def _wrong_method(checkpoint: dict[str, Any], wanted: type) -> UserError:
+    name = str(checkpoint.get("method", "an unknown method")).rpartition(".")[2]
+    return UserError(
+        f"checkpoint is of {name}, not {wanted.__name__}: give the model configuration it was trained with, "
+        "or another checkpoint"
+    )

@@ -1,0 +1,77 @@
+"""The Light Transport Layer: embedding and PointNet for points, a fully connected ResNet for photons."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class PointEmbedding(nn.Module):
+    """A learned vector for each point of each scene; `num_points` is every scene's number of points N."""
+
+    def __init__(self, num_scenes: int, num_points: int, channels: int) -> None:
+        super().__init__()
+        self.num_points = num_points
+        self.table = nn.Embedding(num_scenes * num_points, channels)
+        nn.init.normal_(self.table.weight, std=0.01)
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Scene indices (B,) -> (B, N, channels)."""
+        points = torch.arange(self.num_points, device=scene.device)
+        return self.table(scene[:, None] * self.num_points + points)
+
+
+class ResidualBlock(nn.Module):
+    """Pre-activation residual block of two linear layers on the last axis (..., in) -> (..., out).
+
+    As in Occupancy Networks (Mescheder et al. 2019): the shortcut is linear where the widths differ.
+    """
+
+    def __init__(self, in_features: int, hidden: int, out_features: int) -> None:
+        super().__init__()
+        self.fc_0 = nn.Linear(in_features, hidden)
+        self.fc_1 = nn.Linear(hidden, out_features)
+        self.shortcut = (
+            nn.Identity() if in_features == out_features else nn.Linear(in_features, out_features, bias=False)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.shortcut(x) + self.fc_1(F.relu(self.fc_0(F.relu(x))))
+
+
+def masked_max(x: Tensor, mask: Tensor) -> Tensor:
+    """Maximum of x (B, N, C) over the points in mask (B, N) bool: (B, C), zero where the mask is empty."""
+    maximum = x.masked_fill(~mask[..., None], -torch.inf).amax(dim=1)
+    return torch.where(mask.any(dim=1, keepdim=True), maximum, 0)
+
+
+class PointNet(nn.Module):
+    """Supplementary, "Light Transport Layer": (B, N, in_features), visible (B, N) bool -> (B, N, features).
+
+    A preprocessing layer, then `depth` PointNet blocks, each a residual block to features/2 local features
+    concatenated with their maximum over the visible points.
+    """
+
+    def __init__(self, in_features: int, features: int = 64, hidden: int = 32, depth: int = 2) -> None:
+        super().__init__()
+        self.preprocess = nn.Linear(in_features, features)
+        self.blocks = nn.ModuleList(ResidualBlock(features, hidden, features // 2) for _ in range(depth))
+
+    def forward(self, points: Tensor, visible: Tensor) -> Tensor:
+        x = self.preprocess(points)
+        for block in self.blocks:
+            local = block(x)
+            x = torch.cat([local, masked_max(local, visible)[:, None].expand_as(local)], dim=-1)
+        return x
+
+
+class PhotonNetwork(nn.Sequential):
+    """Sec. "Implementation Details": a fully connected ResNet, each photon for itself: (B, P, in_features) ->
+    (B, P, features)."""
+
+    def __init__(self, in_features: int, features: int = 64, hidden: int = 32, depth: int = 2) -> None:
+        super().__init__(
+            nn.Linear(in_features, features),
+            *(ResidualBlock(features, hidden, features) for _ in range(depth)),
+        )

@@ -1,0 +1,17 @@
+"""Where the project's own configs and the user's scenes lie."""
+
+import os
+from pathlib import Path
+
+PROJECT = Path(__file__).resolve().parents[1]
+CONFIGS = PROJECT / "configs"
+
+
+def scenes_root() -> Path:
+    """The folder of downloaded scenes: `NLT_SCENES`, else `../shared/scenes` beside the project."""
+    return Path(os.environ.get("NLT_SCENES", PROJECT.parent / "shared" / "scenes"))
+
+
+def find_config(kind: str, name: str) -> Path:
+    """A config by name (`configs/<kind>/<name>.yaml`) or by path."""
+    return Path(name) if name.endswith((".yaml", ".yml")) else CONFIGS / kind / f"{name}.yaml"

@@ -1,0 +1,1 @@
+"""Everything that traces a ray."""

@@ -1,0 +1,187 @@
+"""Everything that traces a ray: path-traced radiance of any pixels, the G-buffer, photons.
+
+Everything comes back as numpy arrays in metres, world coordinates and linear, unclamped RGB.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from nlt.scenes.assembly import Scene
+from nlt.scenes.camera import Camera
+from nlt.scenes.lanes import is_jit, launch
+from nlt.scenes.pointcloud import diffuse_albedo
+
+# Lanes traced at once: bounds memory (about 1 kB a lane).
+_MAX_LANES = 1 << 20
+_POWER_SAMPLES = 4096
+
+
+class Renderer:
+    """Traces rays through a scene in its current state (`scene.set_state`)."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        # Infinite depth with Russian roulette: a bound on the depth would bias the teacher.
+        self.integrator = mi.load_dict({"type": "path", "max_depth": -1})
+        self.emitters = list(scene.mi_scene.emitters())
+        freeze: Callable = dr.freeze if is_jit() else lambda kernel: kernel
+        # A frozen kernel is traced once, not at every call: 6 ms instead of 300 ms for a 64x64 image at 1 spp.
+        self._radiance = freeze(_radiance)
+        self._gbuffer = freeze(_gbuffer)
+        self._photons = [freeze(_photons) for _ in self.emitters]
+
+    def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
+        """Path-traced radiance; traces the pixels asked for and no others.
+
+        Args:
+            pixels: (n,) flat indices, row by row; None for the whole image.
+
+        Returns:
+            (3, H, W) float32 for the whole image, else (3, n).
+        """
+        if not is_jit():
+            # A Python loop per path costs more than C++ per image unless few pixels are asked for.
+            if pixels is None:
+                return self._scalar_image(camera, spp, seed)
+            return self._trace(camera, spp, seed, pixels)
+        if pixels is None:
+            image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
+            return image.reshape(3, camera.height, camera.width)
+        return self._trace(camera, spp, seed, pixels)
+
+    def _trace(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray) -> np.ndarray:
+        corner = np.stack([pixels % camera.width, pixels // camera.width], 1).astype(np.float32)
+        total = np.zeros((len(pixels), 3))
+        batch = max(1, min(spp, _MAX_LANES // max(len(pixels), 1)))
+        fixed = self._camera_values(camera)
+        for k, start in enumerate(range(0, spp, batch)):
+            count = min(batch, spp - start)
+            sampler = mi.load_dict({"type": "independent"})
+            lanes = len(pixels) * count
+            sub_seed = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+            sampler.seed(dr.opaque(mi.UInt32, sub_seed) if is_jit() else sub_seed, lanes if is_jit() else 1)
+            corners = {"corner": ("Point2f", np.repeat(corner, count, axis=0))}
+            fixed |= {"integrator": self.integrator, "sampler": sampler}
+            (values,) = launch(self._radiance, corners, **fixed)
+            # Samples of a pixel lie side by side: summing them here is deterministic, an atomic add is not.
+            total += values.reshape(len(pixels), count, 3).sum(1, dtype=np.float64)
+        return (total / spp).T.astype(np.float32)
+
+    def _scalar_image(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
+        view_to_world = np.linalg.inv(camera.world_to_view.astype(float))
+        view_to_world[:3, 3] *= self.scene.description.units_per_metre
+        sensor = mi.load_dict({
+            "type": "perspective",
+            "fov": camera.fov,
+            "near_clip": 1e-4,
+            # Mitsuba's camera looks along +z as ours, but its x points left and its y up.
+            "to_world": mi.ScalarTransform4f(view_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+            "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
+        })  # fmt: skip
+        image = mi.render(self.scene.mi_scene, sensor=sensor, integrator=self.integrator, spp=spp, seed=seed)
+        return np.moveaxis(np.array(image)[..., :3], 2, 0).astype(np.float32)
+
+    def _camera_values(self, camera: Camera) -> dict[str, Any]:
+        """Opaque, so that a new view runs the kernel that the last one compiled."""
+        units = self.scene.description.units_per_metre
+        right, down, forward = camera.rotation.T
+        values = {
+            "origin": mi.Point3f((camera.position * units).tolist()),
+            # A pixel's ray direction is affine in its coordinates.
+            "du": mi.Vector3f((right / float(camera.matrix[0, 0])).tolist()),
+            "dv": mi.Vector3f((down / float(camera.matrix[1, 1])).tolist()),
+            "d0": mi.Vector3f((forward - right * (camera.matrix[0, 2] / camera.matrix[0, 0])
+                               - down * (camera.matrix[1, 2] / camera.matrix[1, 1])).tolist()),
+        }  # fmt: skip
+        if is_jit():
+            dr.make_opaque(values)
+        return {"scene": self.scene.mi_scene, **values}
+
+    def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
+        """Depth (1, H, W), shading normal (3, H, W), albedo (3, H, W) at pixel centres; primary rays only."""
+        lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
+        point, normal, albedo, valid = launch(self._gbuffer, lanes, **self._camera_values(camera))
+        metres = point.astype(float) / self.scene.description.units_per_metre
+        # Along the camera's axis, from its centre.
+        depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
+        image = lambda a: np.where(valid[:, None], a, 0).T.reshape(-1, camera.height, camera.width)
+        return {"depth": image(depth[:, None]).astype(np.float32), "normal": image(normal), "albedo": image(albedo)}
+
+    @functools.cached_property
+    def powers(self) -> np.ndarray:
+        """(E,) mean power over RGB of each emitter in scene units: the mean weight of its sampled rays."""
+        uniform = np.random.default_rng(0).random((_POWER_SAMPLES, 5))
+        return np.array([self._cast(k, uniform)[2].mean() for k in range(len(self.emitters))])
+
+    def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
+        lanes = {
+            "u0": ("Float", uniform[:, 0]),
+            "u1": ("Point2f", uniform[:, 1:3]),
+            "u2": ("Point2f", uniform[:, 3:5]),
+        }
+        fixed = {"scene": self.scene.mi_scene, "emitter": self.emitters[emitter]}
+        return launch(self._photons[emitter], lanes, **fixed)
+
+    def photons(self, count: int, seed: int) -> dict[str, np.ndarray]:
+        """Photons from all emitters in proportion to power, and where they first meet the scene.
+
+        Returns:
+            photon_origin, photon_direction, photon_flux, photon_hit (count, 3) and photon_valid (count,).
+            Flux sums, in expectation, to the emitters' power.
+        """
+        rng = np.random.default_rng(seed)
+        share = self.powers / self.powers.sum()
+        # Systematic resampling: each emitter gets its share of the photons, rounded at random.
+        edges = np.floor(np.concatenate([[0], np.cumsum(share)]) * count + rng.random())
+        edges[-1] = edges[0] + count
+        parts = []
+        for k, number in enumerate(np.diff(edges).astype(int)):
+            if number:
+                origin, direction, flux, hit, valid = self._cast(k, rng.random((number, 5)))
+                parts.append((origin, direction, flux / (share[k] * count), hit, valid))
+        origin, direction, flux, hit, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
+        units = self.scene.description.units_per_metre
+        return {
+            "photon_origin": origin / units,
+            "photon_direction": direction,
+            "photon_flux": flux / units**2,
+            "photon_hit": np.where(valid[:, None], hit / units, 0),
+            "photon_valid": valid.astype(bool),
+        }
+
+
+def _ray(corner: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:
+    return mi.Ray3f(origin, dr.normalize(d0 + corner.x * du + corner.y * dv))
+
+
+def _radiance(scene: Any, integrator: Any, sampler: Any, corner: Any, **camera: Any) -> tuple:
+    # Box filter: uniform in the pixel.
+    ray = mi.RayDifferential3f(_ray(corner + sampler.next_2d(), **camera))
+    value, valid, _ = integrator.sample(scene, sampler, ray)
+    return (mi.Color3f(dr.select(valid, value, 0)),)
+
+
+def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
+    ray = _ray(position, **camera)
+    interaction = scene.ray_intersect(ray)
+    valid = interaction.is_valid()
+    albedo = diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
+    return interaction.p, interaction.sh_frame.n, albedo, valid
+
+
+def _photons(scene: Any, emitter: Any, u0: Any, u1: Any, u2: Any) -> tuple:
+    ray, weight = emitter.sample_ray(mi.Float(0), u0, u1, u2)
+    interaction = scene.ray_intersect(ray)
+    return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid()
+
+
+def _any(valid: Any) -> bool:
+    """Scalar rays that miss have no BSDF to ask; arrays mask it themselves."""
+    return True if is_jit() else bool(valid)

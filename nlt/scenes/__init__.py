@@ -1,0 +1,1 @@
+"""Scenes, movable objects, states, cameras and point clouds."""

@@ -1,0 +1,247 @@
+"""A described scene, loaded into Mitsuba so that moving an object rebuilds nothing that did not move.
+
+What never moves and each movable object are shape groups with an acceleration structure of their own; a state
+only sets their instances' transforms. Emitting shapes cannot be instanced and stay plain meshes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from nlt.errors import UserError
+from nlt.scenes.description import BUILTIN, MOVING_LIGHT, Movable, SceneDescription
+from nlt.scenes.lanes import is_jit
+from nlt.scenes.state import SceneState, rest_state
+
+# A removed object shrinks to a speck of a micrometre: no ray meets it, and no kernel has to be compiled anew for
+# a scene with fewer shapes.
+_SPECK = 1e-6
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A triangle mesh. `vertices` (V, 3) in metres, `faces` (F, 3), `uv` (V, 2) or None, live BSDF and emitter."""
+
+    id: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None
+    bsdf: Any
+    emitter: Any | None
+
+    @property
+    def face_areas(self) -> np.ndarray:
+        """(F,) m²."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+class Scene:
+    """A scene in one experiment, in one state at a time.
+
+    Args:
+        description: of the scene.
+        experiment: "static" and "fixed_lights" keep the scene's own emitters; "moving_lights" turns them all off
+            and hangs one rectangular area light under the ceiling instead (Sec. Dynamic Objects and Dynamic Lights).
+
+    Raises:
+        UserError: the file does not load, a shape is missing, or nothing emits light.
+    """
+
+    def __init__(self, description: SceneDescription, experiment: str) -> None:
+        self.description, self.experiment = description, experiment
+        self.movables = description.movables(experiment)
+        own_lights = experiment != "moving_lights"
+        source = _load(description)
+        meshes = {shape.id(): shape for shape in source.shapes()}
+        self._check_shapes(set(meshes))
+        self.environment = source.environment() if own_lights else None
+        if own_lights and not source.emitters():
+            raise UserError(
+                f"{description.file}: source: {description.source} has no emitters; add one, or use moving_lights"
+            )
+        self.shapes = {name: _read(mesh, description, own_lights) for name, mesh in meshes.items()}
+        if not own_lights:
+            meshes = {n: _without_emitter(m, self.shapes[n]) if m.is_emitter() else m for n, m in meshes.items()}
+        self._assemble(meshes)
+        self.set_state(rest_state(description, experiment))
+
+    def _check_shapes(self, known: set[str]) -> None:
+        claimed: dict[str, str] = {}
+        for movable in self.description.objects:
+            for shape in movable.shapes:
+                where = f"{self.description.file}: objects.{movable.name}.shapes"
+                if shape not in known:
+                    raise UserError(f"{where}: the scene has no shape {shape!r}; its shapes are {_some(known)}")
+                if shape in claimed:
+                    raise UserError(f"{where}: shape {shape!r} already belongs to {claimed[shape]}")
+                claimed[shape] = movable.name
+
+    def _assemble(self, meshes: dict[str, Any]) -> None:
+        """One instance per movable object and one for the rest; emitters and environment beside them."""
+        parts: dict[str, Any] = {"type": "scene"}
+        owner = {shape: m.name for m in self.movables for shape in m.shapes}
+        groups: dict[str, dict[str, Any]] = {}
+        for name, mesh in meshes.items():
+            if mesh.is_emitter():
+                parts[f"emitter_{name}"] = mesh
+            else:
+                groups.setdefault(owner.get(name, "static"), {})[name] = mesh
+        for key, members in groups.items():
+            group = mi.load_dict({"type": "shapegroup", **members})
+            parts[f"group_{key}"] = group
+            parts[f"instance_{key}"] = {"type": "instance", "to_world": mi.ScalarTransform4f(), "of": group}
+        if self.environment is not None:
+            parts["environment"] = self.environment
+        if not self._own_lights:
+            parts[f"emitter_{MOVING_LIGHT}"] = self._moving_light()
+        self.mi_scene = mi.load_dict(parts)
+        if not self._own_lights:
+            self.shapes[MOVING_LIGHT] = self._light_shape()
+        self._parameters = mi.traverse(self.mi_scene)
+        self._instances = {m.name: f"instance_{m.name}.to_world" for m in self.movables if m.name in groups}
+        self._moving_meshes = {
+            m.name: {
+                # Mitsuba names a plain mesh's parameters by its own id.
+                key: np.array(self._parameters[key]).reshape(-1, 3)
+                for shape in m.shapes
+                if shape in meshes and meshes[shape].is_emitter()
+                for key in [f"{shape}.vertex_positions"]
+            }
+            for m in self.movables
+        }
+        moved = {*self._instances.values(), *(k for v in self._moving_meshes.values() for k in v)}
+        if not self._own_lights:
+            moved.add(f"emitter_{MOVING_LIGHT}.to_world")
+        self._parameters.keep(sorted(moved))
+
+    @property
+    def _own_lights(self) -> bool:
+        return self.experiment != "moving_lights"
+
+    def _moving_light(self) -> dict[str, Any]:
+        light = self.description.light
+        assert light is not None  # movables() has said so
+        return {
+            "type": "rectangle",
+            "to_world": self._light_transform(np.zeros(3)),
+            "black": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            "light": {"type": "area", "radiance": {"type": "rgb", "value": light.radiance.tolist()}},
+        }
+
+    def _light_shape(self) -> Shape:
+        """The moving light's quad, so that points are sampled on it too."""
+        light = self.description.light
+        assert light is not None
+        # Its own BSDF and emitter: others beside them would join every virtual call of a compiled kernel.
+        (rectangle,) = [s for s in self.mi_scene.shapes() if s.is_emitter()]
+        corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+        vertices = corners * [*light.size, 1] @ _facing_down(self.description.up).T + light.centre
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        return Shape(MOVING_LIGHT, vertices, faces, None, rectangle.bsdf(), rectangle.emitter())
+
+    def _light_transform(self, translation: np.ndarray) -> Any:
+        light, units = self.description.light, self.description.units_per_metre
+        assert light is not None
+        matrix = np.eye(4)
+        matrix[:3, :3] = _facing_down(self.description.up) * [light.size[0] / 2, light.size[1] / 2, 1] * units
+        matrix[:3, 3] = (light.centre + translation) * units
+        return mi.ScalarTransform4f(matrix)
+
+    def set_state(self, state: SceneState) -> None:
+        """Move and remove objects; the next rays see the new state."""
+        self.state = state
+        units = self.description.units_per_metre
+        for movable, translation, present in zip(self.movables, state.translation, state.present, strict=True):
+            offset, scale = translation.astype(float) * units, 1.0 if present else _SPECK
+            if movable.name == MOVING_LIGHT:
+                transform = self._light_transform(translation.astype(float))
+                self._parameters[f"emitter_{MOVING_LIGHT}.to_world"] = transform
+            if movable.name in self._instances:
+                centre = self._centre(movable) * units
+                to_world = mi.ScalarTransform4f().translate(list(centre * (1 - scale) + offset)).scale(scale)
+                self._parameters[self._instances[movable.name]] = to_world
+            for key, rest in self._moving_meshes[movable.name].items():
+                centre = self._centre(movable) * units
+                moved = (rest - centre) * scale + centre + offset
+                self._parameters[key] = moved.ravel() if is_jit() else moved.ravel().tolist()
+        if len(self._parameters):
+            self._parameters.update()
+            if is_jit():
+                # Otherwise the transforms are literals, and every state compiles its kernels anew.
+                dr.make_opaque({key: self._parameters[key] for key in self._parameters.keys()})  # noqa: SIM118
+
+    def _centre(self, movable: Movable) -> np.ndarray:
+        vertices = np.concatenate([self.shapes[name].vertices for name in movable.shapes])
+        return (vertices.min(0) + vertices.max(0)) / 2
+
+
+def _some(names: set[str]) -> str:
+    listed = sorted(names)
+    return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
+
+
+def _facing_down(up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes +z, a rectangle's normal, to -up."""
+    first = np.roll(up, 1)
+    return np.stack([first, np.cross(-up, first), -up], axis=1)
+
+
+def _load(description: SceneDescription) -> Any:
+    if description.path is None:
+        from nlt.scenes import builtin
+
+        name = description.source.removeprefix(BUILTIN)
+        if name not in builtin.BUILTINS:
+            known = ", ".join(builtin.BUILTINS)
+            raise UserError(f"{description.file}: source: no built-in scene {name!r}; known are {known}")
+        return builtin.mitsuba_scene(name)
+    try:
+        # optimize=False: otherwise meshes that share a BSDF are merged and lose their ids.
+        return mi.load_file(str(description.path), optimize=False)
+    except RuntimeError as error:
+        raise UserError(f"{description.path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
+
+
+def _read(mesh: Any, description: SceneDescription, own_lights: bool) -> Shape:
+    if not isinstance(mesh, mi.Mesh):
+        kind = type(mesh).__name__
+        raise UserError(f"{description.source}: shape {mesh.id()!r} is a {kind}; convert it to a triangle mesh")
+    parameters = mi.traverse(mesh)
+    uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
+    return Shape(
+        mesh.id(),
+        np.array(parameters["vertex_positions"], float).reshape(-1, 3) / description.units_per_metre,
+        np.array(parameters["faces"]).reshape(-1, 3).astype(np.int64),
+        uv,
+        mesh.bsdf(),
+        mesh.emitter() if own_lights and mesh.is_emitter() else None,
+    )
+
+
+def _without_emitter(mesh: Any, shape: Shape) -> Any:
+    """The same mesh, turned off: an emitter of zero radiance would still be sampled and add noise."""
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = shape.bsdf
+    old = mi.traverse(mesh)
+    copy = mi.Mesh(
+        shape.id,
+        mesh.vertex_count(),
+        mesh.face_count(),
+        props=properties,
+        has_vertex_normals=mesh.has_vertex_normals(),
+        has_vertex_texcoords=mesh.has_vertex_texcoords(),
+    )
+    new = mi.traverse(copy)
+    for key in ("faces", "vertex_positions", "vertex_normals", "vertex_texcoords"):
+        if key in new and key in old:
+            new[key] = old[key]
+    new.update()
+    copy.set_id(shape.id)
+    return copy
+

@@ -1,0 +1,71 @@
+"""The perspective camera: K, world-to-view, and the rays through pixel centres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; conventions as in `nlt.data.sample` (x right, y down, z forward; metres).
+
+    Attributes:
+        matrix: (3, 3) K, view space to pixels.
+        world_to_view: (4, 4) T, rigid.
+    """
+
+    matrix: np.ndarray
+    world_to_view: np.ndarray
+    width: int
+    height: int
+
+    @classmethod
+    def look_at(
+        cls, position: np.ndarray, target: np.ndarray, up: np.ndarray, fov: float, width: int, height: int
+    ) -> Camera:
+        """A camera at `position` facing `target`, with a horizontal field of view `fov` in degrees."""
+        forward = np.asarray(target, float) - position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        world_to_view = np.eye(4)
+        world_to_view[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        world_to_view[:3, 3] = -world_to_view[:3, :3] @ position
+        focal = width / 2 / np.tan(np.radians(fov) / 2)
+        matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        # Stored samples are float32: round here, so that what is rendered is what is stored.
+        return cls(matrix.astype(np.float32), world_to_view.astype(np.float32), width, height)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) view-to-world rotation, float64."""
+        return self.world_to_view[:3, :3].T.astype(float)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) world position of the camera's centre, float64."""
+        return -self.rotation @ self.world_to_view[:3, 3]
+
+    @property
+    def fov(self) -> float:
+        """Horizontal field of view in degrees."""
+        return float(np.degrees(2 * np.arctan(self.width / 2 / self.matrix[0, 0])))
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit world directions (n, 3) through continuous pixel coordinates (n, 2)."""
+        focal, centre = np.diag(self.matrix)[:2].astype(float), self.matrix[:2, 2].astype(float)
+        view = np.concatenate([(pixels - centre) / focal, np.ones((len(pixels), 1))], 1)
+        view /= np.linalg.norm(view, axis=1, keepdims=True)
+        return view @ self.rotation.T
+
+    def centres(self) -> np.ndarray:
+        """(H*W, 2) continuous coordinates of all pixel centres, row by row."""
+        rows, columns = np.mgrid[: self.height, : self.width]
+        return np.stack([columns.ravel(), rows.ravel()], 1) + 0.5
+
+    def view_directions(self) -> np.ndarray:
+        """(3, H, W) float32 view direction map: world, unit, through pixel centres (Sec. Method)."""
+        directions = self.directions(self.centres()).T.reshape(3, self.height, self.width)
+        return directions.astype(np.float32)

@@ -1,0 +1,207 @@
+"""What `scene.yaml` says of a scene, read strictly: movable objects, camera volume, exposure, moving light.
+
+Lengths in the file are in the scene's own units, so that they can be read off its XML; here, as everywhere
+else in nlt, they are metres.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import yaml
+
+from nlt.errors import UserError
+from nlt.paths import find_config, scenes_root
+
+Experiment = Literal["static", "fixed_lights", "moving_lights"]
+EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
+# Material type of a surface, by the lobes of its BSDF; the index into this tuple is what is stored.
+MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
+MOVING_LIGHT = "moving_light"  # its name as a movable object, and its shape id
+UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+BUILTIN = "builtin:"
+
+
+@dataclass(frozen=True)
+class Movable:
+    """An object that a state translates or removes: `box` (2, 3) holds its allowed translations, metres."""
+
+    name: str
+    shapes: tuple[str, ...]
+    box: np.ndarray
+    removable: bool = True
+
+
+@dataclass(frozen=True)
+class MovingLight:
+    """The rectangular ceiling light of the dynamic-lights experiment; `box` (2, 3): its centre's positions."""
+
+    size: np.ndarray
+    radiance: np.ndarray
+    box: np.ndarray
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Where it hangs when its translation is zero."""
+        return self.box.mean(0)
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling)."""
+
+    name: str
+    file: Path
+    source: str
+    units_per_metre: float
+    up: np.ndarray
+    exposure: float
+    fov: float
+    camera: np.ndarray
+    look_at: np.ndarray
+    objects: tuple[Movable, ...]
+    light: MovingLight | None
+
+    def movables(self, experiment: str) -> tuple[Movable, ...]:
+        """What a state of this experiment moves: nothing, the objects, or the objects and the light."""
+        if experiment == "static":
+            return ()
+        if experiment == "fixed_lights":
+            return self.objects
+        if self.light is None:
+            raise UserError(f"{self.file}: moving_light: missing, but the experiment moving_lights needs it")
+        box = self.light.box - self.light.centre
+        return (*self.objects, Movable(MOVING_LIGHT, (MOVING_LIGHT,), box, removable=False))
+
+    @property
+    def path(self) -> Path | None:
+        """The Mitsuba XML; None for a built-in scene."""
+        return None if self.source.startswith(BUILTIN) else Path(self.source)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over everything the scene is made of: `scene.yaml`, the XML and the files it names."""
+        files = [self.file]
+        if self.path is None:
+            files.append(Path(__file__).with_name("builtin.py"))
+        else:
+            named = re.findall(r'value="([^"]+\.\w+)"', self.path.read_text())
+            files += [self.path, *sorted({f for n in named if (f := self.path.parent / n).is_file()})]
+        total = hashlib.sha256()
+        for file in files:
+            total.update(hashlib.sha256(file.read_bytes()).digest())
+        return total.hexdigest()
+
+
+class _Section:
+    """A mapping of the file that knows its name, for error messages, and which keys were asked for."""
+
+    def __init__(self, file: Path, name: str, data: Any, known: tuple[str, ...]) -> None:
+        self.file, self.name = file, name
+        if not isinstance(data, Mapping):
+            raise UserError(f"{file}: {name or 'the file'} must be a mapping with the keys {', '.join(known)}")
+        for key in data:
+            if key not in known:
+                raise UserError(f"{file}: {self.field(key)}: unknown key; known are {', '.join(known)}")
+        self.data = data
+
+    def field(self, key: str) -> str:
+        return f"{self.name}.{key}" if self.name else str(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        value = self.data.get(key, default)
+        if value is None:
+            raise UserError(f"{self.file}: {self.field(key)}: missing")
+        return value
+
+    def numbers(self, key: str, shape: tuple[int, ...], default: Any = None) -> np.ndarray:
+        try:
+            array = np.array(self.get(key, default), float)
+        except (TypeError, ValueError):
+            array = np.array(np.nan)
+        if array.shape != shape or not np.isfinite(array).all():
+            what = "a number" if shape == () else f"numbers of shape {' x '.join(map(str, shape))}"
+            raise UserError(f"{self.file}: {self.field(key)}: must be {what}, is {self.data.get(key)!r}")
+        return array
+
+    def positive(self, key: str, shape: tuple[int, ...] = (), default: Any = None) -> np.ndarray:
+        array = self.numbers(key, shape, default)
+        if not (array > 0).all():
+            raise UserError(f"{self.file}: {self.field(key)}: must be above zero, is {array.tolist()}")
+        return array
+
+    def box(self, key: str) -> np.ndarray:
+        box = self.numbers(key, (2, 3))
+        if (box[0] > box[1]).any():
+            raise UserError(f"{self.file}: {self.field(key)}: is empty: minimum {box[0]} above maximum {box[1]}")
+        return box
+
+
+def load_description(name: str) -> SceneDescription:
+    """Read `configs/scenes/<name>.yaml`, or the file at a path.
+
+    Raises:
+        UserError: the file or its scene is missing, a key is unknown or missing, a box is empty.
+    """
+    file = find_config("scenes", name)
+    try:
+        data = yaml.safe_load(file.read_text())
+    except FileNotFoundError:
+        known = ", ".join(sorted(p.stem for p in find_config("scenes", "x").parent.glob("*.yaml")))
+        raise UserError(f"{file}: no such scene description; known scenes are {known}") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
+    keys = ("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "objects", "moving_light")
+    top = _Section(file, "", data, keys)
+    scale = 1.0 / float(top.positive("units_per_metre", default=1.0))
+    up = top.get("up", "y")
+    if up not in UP:
+        raise UserError(f"{file}: up: must be one of {', '.join(UP)}, is {up!r}")
+    fov = float(top.positive("fov", default=70.0))
+    if fov >= 180:
+        raise UserError(f"{file}: fov: must be below 180 degrees, is {fov:g}")
+    view = _Section(file, "camera", top.get("camera"), ("min", "max"))
+    camera = np.stack([view.numbers("min", (3,)), view.numbers("max", (3,))]) * scale
+    if (camera[0] > camera[1]).any():
+        raise UserError(f"{file}: camera: is empty: min is above max")
+    objects = []
+    for key, value in dict(data.get("objects") or {}).items():
+        section = _Section(file, f"objects.{key}", value, ("shapes", "box"))
+        objects.append(Movable(str(key), tuple(map(str, section.get("shapes"))), section.box("box") * scale))
+    light = None
+    if data.get("moving_light") is not None:
+        section = _Section(file, MOVING_LIGHT, data[MOVING_LIGHT], ("size", "radiance", "box"))
+        size = section.positive("size", (2,)) * scale
+        light = MovingLight(size, section.numbers("radiance", (3,)), section.box("box") * scale)
+    return SceneDescription(
+        name=str(top.get("name", file.stem)),
+        file=file,
+        source=_find_source(file, str(top.get("source"))),
+        units_per_metre=1.0 / scale,
+        up=np.array(UP[up]),
+        exposure=float(top.positive("exposure", default=1.0)),
+        fov=fov,
+        camera=camera,
+        look_at=camera.mean(0) + (camera - camera.mean(0)) / 2,
+        objects=tuple(objects),
+        light=light,
+    )
+
+
+def _find_source(file: Path, source: str) -> str:
+    if source.startswith(BUILTIN):
+        return source
+    tried = [Path(source)] if Path(source).is_absolute() else [file.parent / source, scenes_root() / source]
+    for path in tried:
+        if path.is_file():
+            return str(path.resolve())
+    raise UserError(
+        f"{file}: source: no scene file at {' or '.join(map(str, tried))}; set NLT_SCENES to the scenes' folder"
+    )

@@ -1,0 +1,322 @@
+"""Every method in configs/model: its contract with batch, trainer and checkpoint; and the sparse denoiser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+from jsonargparse import ArgumentParser
+from lightning.pytorch.loggers import TensorBoardLogger
+from synthetic import POINTS, SCENES, synthetic_batch
+from torch.utils.data import DataLoader
+
+from nlt.baselines.cnn import CNN
+from nlt.baselines.denoising import SparseDenoising, pixel_mask
+from nlt.errors import UserError
+from nlt.models import losses
+from nlt.models.image_grid import ImageGrid
+from nlt.models.module import RenderingModule
+from nlt.models.nlt import NeuralLightTransport
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs/model").glob("*.yaml"))
+SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
+
+
+def build(config: Path, scale: Path | None = None) -> RenderingModule:
+    """As the command line does: the model's file, then overrides without class_path."""
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_argument("--config", action="config")
+    parser.add_subclass_arguments(RenderingModule, "model")
+    files = [f"--config={path}" for path in (config, scale) if path]
+    overrides = [f"--model.init_args.{name}={value}" for name, value in SIZE.items()]
+    torch.manual_seed(0)
+    return parser.instantiate_classes(parser.parse_args([*files, *overrides])).model
+
+
+@pytest.fixture(params=CONFIGS, ids=lambda path: path.stem)
+def method(request: pytest.FixtureRequest) -> RenderingModule:
+    return build(request.param)
+
+
+def trainer(path: Path, **kwargs) -> L.Trainer:
+    quiet = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False}
+    return L.Trainer(default_root_dir=path, accelerator="cpu", **(quiet | {"max_epochs": 1} | kwargs))
+
+
+def loader(*batches: dict[str, torch.Tensor]) -> DataLoader:
+    return DataLoader(list(batches), batch_size=None)
+
+
+def test_one_training_step_reaches_every_parameter(method):
+    loss = method.training_step(synthetic_batch(), 0)
+    loss.backward()
+    assert loss.isfinite()
+    for name, parameter in method.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+
+
+def test_output(method):
+    batch = synthetic_batch(size=13)
+    with torch.no_grad():
+        features = method.eval().features(batch, method.transport(batch))
+        prediction = method(batch)
+    assert features.shape == (2, method.feature_channels, 13, 13)
+    assert prediction.shape == (2, 3, 13, 13) and prediction.isfinite().all()
+    assert prediction.is_contiguous()
+
+
+def test_inputs_are_sufficient_and_necessary(method):
+    batch = synthetic_batch()
+    declared = {name: batch[name] for name in (*method.inputs, "exposure", "scene", "index")}
+    method.eval()
+    assert torch.equal(method(declared), method(batch))
+    for name in method.inputs:
+        with pytest.raises(KeyError, match=name):
+            method({k: v for k, v in declared.items() if k != name})
+
+
+def test_bfloat16_autocast(method):
+    """A prediction in float32, near that of full precision: no position is rounded."""
+    batch = synthetic_batch()
+    method.eval()
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        mixed = method(batch)
+    assert mixed.dtype == torch.float32
+    torch.testing.assert_close(mixed, method(batch), rtol=0.05, atol=0.05)
+
+
+def test_stages_are_those_of_the_inputs(method):
+    photons = any(name.startswith("photon_") for name in method.inputs)
+    stages = {
+        "gbuffer": "depth" in method.inputs,
+        "photons": photons,
+        "path_tracing": method.pixel_fraction > 0,
+    }
+    assert method.stages == tuple(stage for stage, needed in stages.items() if needed)
+
+
+def test_doubled_exposure_of_halved_light(method):
+    """Exposed radiance is all the network sees, so the prediction only halves."""
+    batch = synthetic_batch()
+    method.eval()
+    expected = method(batch) / 2
+    for name in ("noisy_input", "point_emission", "photon_flux"):
+        batch[name] = batch[name] / 2
+    batch["exposure"] = batch["exposure"] * 2
+    torch.testing.assert_close(method(batch), expected)
+
+
+def test_splitting_the_photons():
+    """Each photon as two of half the flux: the same light, the same prediction."""
+    batch, method = synthetic_batch(), NeuralLightTransport(photons=True, **SIZE).eval()
+    expected = method(batch)
+    for name in method.inputs:
+        if name.startswith("photon_"):
+            batch[name] = torch.cat([batch[name]] * 2, dim=1)
+    batch["photon_flux"] = batch["photon_flux"] / 2
+    torch.testing.assert_close(method(batch), expected)
+
+
+def test_a_scale_without_class_path_is_merged(tmp_path):
+    scale = tmp_path / "scale.yaml"
+    scale.write_text("model:\n  init_args:\n    depth: 1\n")
+    method = build(next(path for path in CONFIGS if path.stem == "nlt_photons"), scale)
+    assert isinstance(method, NeuralLightTransport)
+    assert method.hparams["depth"] == 1 and method.hparams["photons"]
+
+
+# --- loss, trainer, checkpoints ---
+
+
+def test_losses():
+    exposure = torch.tensor([2.0, 0.5])
+    prediction, target = torch.rand(2, 3, 4, 4, requires_grad=True), 10 * torch.rand(2, 3, 4, 4)
+    scale = exposure.view(2, 1, 1, 1)
+    squared = (scale * (prediction - target)) ** 2
+    torch.testing.assert_close(losses.mse(prediction, target, exposure), squared.mean())
+    relative = losses.relative_mse(prediction, target, exposure)
+    weight = 1 / ((scale * prediction.detach()) ** 2 + 0.01)
+    torch.testing.assert_close(relative, (weight * squared).mean())
+    # Linear in the target, so that the noise averages out.
+    (gradient,) = torch.autograd.grad(relative, prediction)
+    expected = 2 * weight * scale**2 * (prediction - target) / target.numel()
+    torch.testing.assert_close(gradient, expected)
+
+
+def test_a_loss_that_is_not_finite_names_the_samples():
+    batch = synthetic_batch()
+    batch["noisy"][0, 0, 3, 3] = torch.nan
+    with pytest.raises(UserError, match=r"nan at step 0.*scenes \[0, 1\], samples \[0, 1\]"):
+        CNN(width=4).training_step(batch, 0)
+
+
+def test_metrics_are_logged(tmp_path):
+    batch, method = synthetic_batch(), CNN(width=4)
+    run = trainer(tmp_path, logger=TensorBoardLogger(tmp_path), callbacks=[ImageGrid(images=3)])
+    run.fit(method, loader(batch), loader(batch, batch))
+    assert {"train/loss", "val/mse", "val/mssim"} <= run.callback_metrics.keys()
+    with torch.no_grad():
+        difference = method.eval()(batch) - batch["reference_a"], method(batch) - batch["reference_b"]
+    expected = (difference[0] * difference[1] * batch["exposure"].view(-1, 1, 1, 1) ** 2).mean()
+    torch.testing.assert_close(run.callback_metrics["val/unbiased_mse"].float(), expected)
+    assert run.optimizers[0].param_groups[0]["lr"] == pytest.approx(5e-4 * 0.99)
+
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(run.logger.log_dir).Reload()
+    (image,) = events.Images("val/images")
+    assert (image.width, image.height) == (4 * 16, 3 * 16)
+
+
+def test_image_grid_without_a_logger(tmp_path):
+    batch = synthetic_batch()
+    del batch["noisy"]
+    run = trainer(tmp_path, callbacks=[ImageGrid()], num_sanity_val_steps=0)
+    run.validate(CNN(width=4), loader(batch), verbose=False)
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory) -> dict[str, Path]:
+    """By method, each after one step."""
+    paths = {}
+    for config in CONFIGS:
+        path = tmp_path_factory.mktemp(config.stem)
+        run = trainer(path, enable_checkpointing=False)
+        run.fit(build(config), loader(synthetic_batch()))
+        paths[config.stem] = path / "last.ckpt"
+        run.save_checkpoint(paths[config.stem])
+    return paths
+
+
+def test_checkpoint_loads_with_weights_only(checkpoints):
+    batch = synthetic_batch()
+    for path in checkpoints.values():
+        checkpoint = torch.load(path, weights_only=True)
+        assert not any("metric" in key for key in checkpoint["state_dict"])
+        restored = RenderingModule.load_from_checkpoint(path)
+        assert restored.class_path() == checkpoint["method"]
+        assert restored.eval()(batch).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "options", "saved", "message"),
+    [
+        (NeuralLightTransport, {}, "cnn", "checkpoint is of CNN, not NeuralLightTransport"),
+        (CNN, {}, "nlt", "checkpoint is of NeuralLightTransport, not CNN"),
+        (NeuralLightTransport, {}, "denoising_1_4", "checkpoint is of SparseDenoising, not Neural"),
+        (CNN, {"width": 8}, "cnn", "checkpoint has width=4, this model width=8"),
+        (CNN, {"depth": 2}, "cnn", "checkpoint has depth=3, this model depth=2"),
+        (
+            NeuralLightTransport,
+            {"num_points": 7},
+            "nlt",
+            "checkpoint has num_points=96, this model num_points=7",
+        ),
+        (
+            NeuralLightTransport,
+            {"photons": True},
+            "nlt",
+            "checkpoint has photons=False, this model photons=True",
+        ),
+        (SparseDenoising, {"one_in": 16}, "denoising_1_4", "checkpoint has one_in=4, this model one_in=16"),
+    ],
+)
+def test_checkpoint_of_another_method(tmp_path, checkpoints, wanted, options, saved, message):
+    """One line, whether a trainer resumes or tests or the class loads."""
+    model, data = wanted(**{**SIZE, **options}), loader(synthetic_batch())
+    run = trainer(tmp_path, max_epochs=2)
+    for load in (
+        lambda: run.fit(model, data, ckpt_path=checkpoints[saved], weights_only=True),
+        lambda: run.test(model, data, ckpt_path=checkpoints[saved], weights_only=True),
+        lambda: wanted.load_from_checkpoint(checkpoints[saved], **options),
+    ):
+        with pytest.raises(UserError, match=message) as error:
+            load()
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("config", ["nlt_photons", "denoising_1_4"])
+def test_resuming_is_exact(tmp_path, config):
+    """Two epochs in one go, or one, a checkpoint and another: the same weights to the bit."""
+    path, data = (
+        next(p for p in CONFIGS if p.stem == config),
+        loader(synthetic_batch(), synthetic_batch(seed=1)),
+    )
+    through = build(path)
+    trainer(tmp_path, max_epochs=2).fit(through, data)
+    first = trainer(tmp_path, max_epochs=1)
+    first.fit(build(path), data)
+    first.save_checkpoint(tmp_path / "first.ckpt")
+    torch.manual_seed(123)
+    resumed = build(path)
+    trainer(tmp_path, max_epochs=2).fit(resumed, data, ckpt_path=tmp_path / "first.ckpt", weights_only=True)
+    for a, b in zip(through.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+# --- the sparse denoiser ---
+
+
+@pytest.mark.parametrize("one_in", [1, 4, 16, 32, 64, 1000])
+def test_mask_has_exactly_the_number_of_pixels(one_in):
+    mask = pixel_mask(torch.arange(20), 16, 15, one_in)
+    assert mask.shape == (20, 1, 16, 15) and mask.dtype == torch.bool
+    assert (mask.sum((1, 2, 3)) == round(16 * 15 / one_in)).all()
+
+
+def test_mask_is_uniform():
+    """Each pixel is chosen at its rate, and neighbours, and successive seeds, are independent."""
+    n, p = 4000, 1 / 4
+    mask = pixel_mask(torch.arange(n), 8, 8, 4)[:, 0].double()
+    assert ((mask.mean(0) - p).abs() < 5 * (p * (1 - p) / n) ** 0.5).all()
+    both = 16 * 15 / (64 * 63)  # without replacement
+    assert abs((mask[:, :, 1:] * mask[:, :, :-1]).mean() - both) < 0.003
+    assert abs((mask[1:] * mask[:-1]).mean() - p**2) < 0.003
+
+
+@pytest.fixture
+def step(monkeypatch: pytest.MonkeyPatch):
+    """Sets the training step."""
+    return lambda n: monkeypatch.setattr(SparseDenoising, "global_step", n)
+
+
+def test_mask_is_fixed_in_evaluation_and_fresh_in_training(step):
+    batch, method = synthetic_batch(4), SparseDenoising(one_in=4, width=4)
+    other_seed = SparseDenoising(one_in=4, width=4, seed=1)
+
+    def masks(model):
+        step(0)
+        first = model.mask(batch, 16, 16)
+        assert torch.equal(first, model.mask(batch, 16, 16))
+        step(1)
+        return first, model.mask(batch, 16, 16)
+
+    (a, b), (c, _) = masks(method.train()), masks(other_seed.train())
+    d, e = masks(method.eval())
+    assert torch.equal(d, e) and torch.equal(d, masks(other_seed.eval())[0])
+    assert not torch.equal(a, b) and not torch.equal(a, c) and not torch.equal(a, d)
+    assert not torch.equal(d[0], d[2])
+    single = {name: value[2:3] for name, value in batch.items()}
+    assert torch.equal(method.mask(single, 16, 16), d[2:3])  # wherever in a batch the sample is
+
+
+def test_pixels_not_traced_have_no_influence():
+    batch, method = synthetic_batch(), SparseDenoising(one_in=4, width=4).eval()
+    expected, mask = method(batch), method.mask(batch, 16, 16)
+    noise = batch["noisy_input"]
+    batch["noisy_input"] = torch.where(mask, noise, torch.nan)
+    assert torch.equal(method(batch), expected)
+    batch["noisy_input"] = torch.where(mask, noise + 1, noise)
+    assert not torch.equal(method(batch), expected)
+
+
+def test_gbuffer_switch():
+    method = SparseDenoising(gbuffer=False, width=4)
+    assert method.inputs == ("noisy_input",) and method.stages == ("path_tracing",)
+    batch = synthetic_batch()
+    names = ("noisy_input", "exposure", "scene", "index")
+    assert method({name: batch[name] for name in names}).shape == (2, 3, 16, 16)
+    assert method.feature_channels == 4 and method.pixel_fraction == 1

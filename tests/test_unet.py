@@ -1,0 +1,45 @@
+"""The U-Net: shapes, number of parameters, memory layout."""
+
+import pytest
+import torch
+
+from nlt.models.unet import UNet
+
+
+@pytest.mark.parametrize("size", [(16, 16), (13, 22), (1, 5), (8, 3)])
+@pytest.mark.parametrize("depth", [0, 1, 3, 4])
+def test_shape(size, depth):
+    net = UNet(5, width=4, depth=depth, out_channels=2)
+    assert net(torch.randn(2, 5, *size)).shape == (2, 2, *size)
+
+
+def test_number_of_parameters():
+    """Width 64, three steps: counted by hand from the supplementary's figure."""
+
+    def conv(a, b):
+        return 9 * a * b + b
+
+    def block(a, b):
+        return conv(a, b) + conv(b, b) + (a * b if a != b else 0)
+
+    down = block(64, 64) + block(64, 128) + block(128, 256) + block(256, 512)
+    up = block(512 + 256, 256) + block(256 + 128, 128) + block(128 + 64, 64)
+    expected = conv(10, 64) + down + up + conv(64, 3)
+    assert sum(p.numel() for p in UNet(10).parameters()) == expected
+
+
+def test_channels_last_gives_the_same():
+    torch.manual_seed(0)
+    net, x = UNet(3, width=4), torch.randn(1, 3, 20, 12)
+    expected = net(x)
+    net = net.to(memory_format=torch.channels_last)
+    result = net(x.contiguous(memory_format=torch.channels_last))
+    torch.testing.assert_close(result, expected, atol=1e-5, rtol=1e-4)
+
+
+def test_receptive_field_spans_the_levels():
+    """A change at one pixel is seen far beyond what the convolutions at full resolution reach."""
+    torch.manual_seed(0)
+    net, x = UNet(1, width=4), torch.zeros(1, 1, 32, 32, requires_grad=True)
+    net(x + torch.rand(x.shape))[0, :, 0, 0].sum().backward()
+    assert x.grad[0, 0, :, 0].nonzero().max() >= 16
