@@ -14,7 +14,6 @@ ROOM = ("floor", "ceiling", "wall_left", "wall_right", "wall_back", "wall_front"
 CONFIGS = Path(__file__).parents[1] / "configs" / "scenes"
 
 
-
 @pytest.fixture(scope="module", params=sorted(BUILTINS))
 def built(request):
     """(description, shapes, live scene) in scalar_rgb."""
@@ -80,8 +79,9 @@ def test_flat_and_smooth_normals(built):
             normals = np.reshape(mi.traverse(live)["vertex_normals"], (-1, 3))
             assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3), key
         else:
-            assert np.allclose(shape.mesh.vertex_normals[shape.mesh.faces],
-                               shape.mesh.face_normals[:, None], atol=1e-6), key
+            assert np.allclose(
+                shape.mesh.vertex_normals[shape.mesh.faces], shape.mesh.face_normals[:, None], atol=1e-6
+            ), key
 
 
 def test_objects_stay_inside(built):
@@ -126,8 +126,7 @@ def test_closed_and_lit(built):
     centre = camera.mean(0)
     to_world = mi.ScalarTransform4f().look_at(camera[0].tolist(), centre.tolist(), [0, 1, 0])
     film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
-    sensor = mi.load_dict(
-        {"type": "perspective", "fov": description["fov"], "to_world": to_world, "film": film})
+    sensor = mi.load_dict({"type": "perspective", "fov": description["fov"], "to_world": to_world, "film": film})
     image = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "path"}), spp=16))
     display = np.clip(image * description["exposure"], 0, 1) ** (1 / 2.2)
     assert np.isfinite(image).all() and 0.2 < display.mean() < 0.7

@@ -55,9 +55,7 @@ def make_batch(n: int = 4, size: int = 24, seed: int = 0) -> tuple[torch.Tensor,
     """Prediction, two reference halves, and exposures; radiance from dark to overexposed."""
     generator = torch.Generator().manual_seed(seed)
     clean = 2 * torch.rand(n, 3, size, size + 8, generator=generator)
-    prediction, a, b = (
-        (clean + 0.1 * torch.randn(clean.shape, generator=generator)).clamp(min=0) for _ in range(3)
-    )
+    prediction, a, b = ((clean + 0.1 * torch.randn(clean.shape, generator=generator)).clamp(min=0) for _ in range(3))
     return prediction, a, b, torch.linspace(0.3, 0.9, n)
 
 
@@ -107,9 +105,7 @@ def test_mssim_matches_skimage():
         f, r = (np.pad(x, ((0, 0), (3, 3), (3, 3)), mode="reflect") for x in pair)
         # Wang et al. divide by N, not by N - 1.
         expected.append(
-            structural_similarity(
-                f, r, win_size=7, data_range=1.0, channel_axis=0, use_sample_covariance=False
-            )
+            structural_similarity(f, r, win_size=7, data_range=1.0, channel_axis=0, use_sample_covariance=False)
         )
     assert metrics.compute()["mssim"].item() == pytest.approx(np.mean(expected), abs=1e-6)
     np.testing.assert_allclose(ImageMetrics.per_image(*batch)["mssim"], expected, atol=1e-6)
@@ -122,9 +118,7 @@ def test_unbiased_mse_is_unbiased():
     true = np.mean((prediction - clean) ** 2)
     estimates, naive = [], []
     for _ in range(400):
-        a, b = (
-            clean * rng.gamma(4, 1 / 4, clean.shape) for _ in range(2)
-        )  # mean `clean`, variance clean² / 4
+        a, b = (clean * rng.gamma(4, 1 / 4, clean.shape) for _ in range(2))  # mean `clean`, variance clean² / 4
         metric = UnbiasedMSE()
         metric.update(*map(torch.from_numpy, (prediction, a, b)))
         estimates.append(metric.compute().item())
@@ -353,9 +347,7 @@ def test_metrics_add_nothing_to_a_checkpoint():
 
 def synchronise(rank: int, folder: str) -> None:
     torch.set_num_threads(1)
-    torch.distributed.init_process_group(
-        "gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2
-    )
+    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2)
     metrics = ImageMetrics(perceptual=False)
     metrics.update(*(x[rank::2] for x in make_batch(5)))  # 3 and 2 images
     torch.save(metrics.compute(), f"{folder}/{rank}.pt")

@@ -144,9 +144,7 @@ def _message(receive: Any) -> str | None:
         return None
 
 
-def _worker(
-    spec: DatasetSpec, directory: Path, job: Any, threads: int, counter: Any, send: Any, parent: int
-) -> None:
+def _worker(spec: DatasetSpec, directory: Path, job: Any, threads: int, counter: Any, send: Any, parent: int) -> None:
     try:
         scene, shards, points = job
         render = SampleRenderer(spec, scene, threads)
@@ -273,5 +271,3 @@ class SampleRenderer:
             if np.isfinite(image).all():
                 return image
         raise UserError(f"{self.description.source}: the path tracer gives non-finite radiance at seed {seed}")
-
-

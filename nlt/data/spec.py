@@ -180,7 +180,9 @@ def read_configs(files: list[str]) -> dict[str, Any]:
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """`over` upon `base`, mapping by mapping."""
-    both = {k: merge(base[k], v) for k, v in over.items() if isinstance(v, Mapping) and isinstance(base.get(k), Mapping)}
+    both = {
+        k: merge(base[k], v) for k, v in over.items() if isinstance(v, Mapping) and isinstance(base.get(k), Mapping)
+    }
     return {**base, **over, **both}
 
 
@@ -197,5 +199,3 @@ def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
     if "scenes" not in data["dataset"]:
         raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
     return DatasetSpec(**data["dataset"]), Path(data.get("root", "datasets"))
-
-

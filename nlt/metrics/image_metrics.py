@@ -196,9 +196,7 @@ class ImageMetrics(nn.Module):
 
     @staticmethod
     @torch.no_grad()
-    def per_image(
-        prediction: Tensor, reference_a: Tensor, reference_b: Tensor, exposure: Tensor
-    ) -> dict[str, Tensor]:
+    def per_image(prediction: Tensor, reference_a: Tensor, reference_b: Tensor, exposure: Tensor) -> dict[str, Tensor]:
         """mse, mssim and unbiased_mse of every image, (B,) each; arguments as of `update`."""
         f, a, b, shown, target = _domains(prediction, reference_a, reference_b, exposure)
         mssim = structural_similarity_index_measure(shown, target, reduction="none", **_SSIM)

@@ -34,9 +34,7 @@ _Kernel = int | tuple[int, int]
 class _Conv(nn.Module):
     """Convolution, batch normalisation, ReLU; named as in torchvision."""
 
-    def __init__(
-        self, channels: int, out: int, kernel: _Kernel, stride: int = 1, padding: int | str = 0
-    ) -> None:
+    def __init__(self, channels: int, out: int, kernel: _Kernel, stride: int = 1, padding: int | str = 0) -> None:
         super().__init__()
         self.conv = nn.Conv2d(channels, out, kernel, stride, padding, bias=False)
         self.bn = nn.BatchNorm2d(out, eps=1e-3)

@@ -115,9 +115,7 @@ class RenderingModule(L.LightningModule):
 
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
         """Eq. (1) with the batch's camera: features (B, N, C) at positions (B, N, 3) to (B, C, H, W)."""
-        return project(
-            features, positions, valid, batch["camera_matrix"], batch["world_to_view"], batch["depth"]
-        )
+        return project(features, positions, valid, batch["camera_matrix"], batch["world_to_view"], batch["depth"])
 
     def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
         """Features to linear radiance (B, 3, H, W); the U-Net itself works in exposed radiance."""

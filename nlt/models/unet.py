@@ -15,9 +15,7 @@ class ConvBlock(nn.Module):
         self.conv_0 = nn.Conv2d(in_channels, out_channels, 3, padding=1)
         self.conv_1 = nn.Conv2d(out_channels, out_channels, 3, padding=1)
         self.shortcut = (
-            nn.Identity()
-            if in_channels == out_channels
-            else nn.Conv2d(in_channels, out_channels, 1, bias=False)
+            nn.Identity() if in_channels == out_channels else nn.Conv2d(in_channels, out_channels, 1, bias=False)
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -36,9 +34,7 @@ class UNet(nn.Module):
         widths = [width * 2**level for level in range(depth + 1)]
         self.conv_in = nn.Conv2d(in_channels, width, 3, padding=1)
         self.down = nn.ModuleList(ConvBlock(widths[max(i - 1, 0)], widths[i]) for i in range(depth + 1))
-        self.up = nn.ModuleList(
-            ConvBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth))
-        )
+        self.up = nn.ModuleList(ConvBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth)))
         self.conv_out = nn.Conv2d(width, out_channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -244,4 +244,3 @@ def _without_emitter(mesh: Any, shape: Shape) -> Any:
     new.update()
     copy.set_id(shape.id)
     return copy
-

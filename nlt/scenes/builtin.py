@@ -114,8 +114,12 @@ def landscape(size: int = 128) -> np.ndarray:
 # ---- shapes ---------------------------------------------------------------------------------------------
 
 
-def quads(bsdf: dict[str, Any], *corners: tuple[Vec, Vec, Vec], tile: float | None = 1.0,
-          emitter: dict[str, Any] | None = None) -> BuiltinShape:
+def quads(
+    bsdf: dict[str, Any],
+    *corners: tuple[Vec, Vec, Vec],
+    tile: float | None = 1.0,
+    emitter: dict[str, Any] | None = None,
+) -> BuiltinShape:
     """Flat parallelograms (origin, u, v) that face u x v; a texture repeats every `tile` metres or fits."""
     points, uvs = [], []
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
@@ -178,8 +182,10 @@ def place(shapes: Shapes, name: str, at: Vec, turn: float = 0.0) -> Shapes:
     matrix = trimesh.transformations.rotation_matrix(np.radians(turn), [0, 1, 0])
     matrix[:3, 3] = at
     # copied first: trimesh transforms in place
-    return {f"{name}_{part}": replace(shape, mesh=shape.mesh.copy().apply_transform(matrix))
-            for part, shape in shapes.items()}
+    return {
+        f"{name}_{part}": replace(shape, mesh=shape.mesh.copy().apply_transform(matrix))
+        for part, shape in shapes.items()
+    }
 
 
 # ---- furniture: at the origin, on the floor, facing +z --------------------------------------------------
@@ -187,40 +193,56 @@ def place(shapes: Shapes, name: str, at: Vec, turn: float = 0.0) -> Shapes:
 
 def table(wood: dict[str, Any], width: float = 1.3, depth: float = 0.8, height: float = 0.74) -> Shapes:
     under = height - 0.04
-    apron: list[Box] = [((0, under - 0.04, s * (depth / 2 - 0.1)), (width - 0.2, 0.08, 0.03))
-                        for s in (-1, 1)]
-    return {"top": boxes(wood, ((0, height - 0.02, 0), (width, 0.04, depth))),
-            "legs": boxes(wood, *legs(width - 0.1, depth - 0.1, under, 0.06), *apron)}
+    apron: list[Box] = [((0, under - 0.04, s * (depth / 2 - 0.1)), (width - 0.2, 0.08, 0.03)) for s in (-1, 1)]
+    return {
+        "top": boxes(wood, ((0, height - 0.02, 0), (width, 0.04, depth))),
+        "legs": boxes(wood, *legs(width - 0.1, depth - 0.1, under, 0.06), *apron),
+    }
 
 
 def chair(wood: dict[str, Any], fabric: dict[str, Any], size: float = 0.44) -> Shapes:
     back = size / 2 - 0.02
     bars: list[Box] = [((s * back, 0.69, -back), (0.04, 0.46, 0.04)) for s in (-1, 1)]
     bars += [((0, y, -back), (size - 0.08, 0.07, 0.025)) for y in (0.64, 0.76, 0.88)]
-    return {"frame": boxes(wood, *legs(size, size, 0.42, 0.04), ((0, 0.44, 0), (size, 0.04, size)), *bars),
-            "seat": boxes(fabric, ((0, 0.475, 0.02), (size - 0.04, 0.03, size - 0.08)))}
+    return {
+        "frame": boxes(wood, *legs(size, size, 0.42, 0.04), ((0, 0.44, 0), (size, 0.04, size)), *bars),
+        "seat": boxes(fabric, ((0, 0.475, 0.02), (size - 0.04, 0.03, size - 0.08))),
+    }
 
 
 def sofa(fabric: dict[str, Any], cushion: dict[str, Any], width: float = 1.9, depth: float = 0.85) -> Shapes:
     arm, seats = 0.18, 2
     inner = width - 2 * arm
-    body: list[Box] = [((0, 0.18, 0), (inner, 0.24, depth)),
-                       ((0, 0.55, -depth / 2 + 0.1), (inner, 0.5, 0.2))]
+    body: list[Box] = [((0, 0.18, 0), (inner, 0.24, depth)), ((0, 0.55, -depth / 2 + 0.1), (inner, 0.5, 0.2))]
     body += [((s * (width - arm) / 2, 0.31, 0), (arm, 0.5, depth)) for s in (-1, 1)]
-    body += [((x, 0.03, z), (0.06, 0.06, 0.06)) for x in (-width / 2 + 0.1, width / 2 - 0.1)
-             for z in (-depth / 2 + 0.1, depth / 2 - 0.1)]
+    body += [
+        ((x, 0.03, z), (0.06, 0.06, 0.06))
+        for x in (-width / 2 + 0.1, width / 2 - 0.1)
+        for z in (-depth / 2 + 0.1, depth / 2 - 0.1)
+    ]
     seat = inner / seats
-    pads: list[Box] = [((seat * (i - (seats - 1) / 2), 0.37, 0.1), (seat - 0.02, 0.14, depth - 0.2))
-                       for i in range(seats)]
+    pads: list[Box] = [
+        ((seat * (i - (seats - 1) / 2), 0.37, 0.1), (seat - 0.02, 0.14, depth - 0.2)) for i in range(seats)
+    ]
     pillow = boxes(cushion, ((0, 0, 0), (0.4, 0.4, 0.12)), tile=None)
     lean = trimesh.transformations.rotation_matrix(-0.3, [1, 0, 0])
     lean[:3, 3] = (inner / 2 - 0.24, 0.64, -depth / 2 + 0.34)
-    return {"body": boxes(fabric, *body), "pads": boxes(fabric, *pads),
-            "pillow": replace(pillow, mesh=pillow.mesh.copy().apply_transform(lean))}
+    return {
+        "body": boxes(fabric, *body),
+        "pads": boxes(fabric, *pads),
+        "pillow": replace(pillow, mesh=pillow.mesh.copy().apply_transform(lean)),
+    }
 
 
-def shelf(wood: dict[str, Any], colours: Sequence[Vec], width: float = 1.0, height: float = 1.75,
-          depth: float = 0.3, boards: int = 5, seed: int = 3) -> Shapes:
+def shelf(
+    wood: dict[str, Any],
+    colours: Sequence[Vec],
+    width: float = 1.0,
+    height: float = 1.75,
+    depth: float = 0.3,
+    boards: int = 5,
+    seed: int = 3,
+) -> Shapes:
     """An open shelf with a back, and books of random sizes on most of its boards."""
     rng = np.random.default_rng(seed)
     t = 0.025
@@ -259,15 +281,18 @@ def vase(bsdf: dict[str, Any], height: float = 0.6) -> Shapes:
 
 def hung(bsdf: dict[str, Any], border: dict[str, Any], width: float, height: float) -> Shapes:
     """A picture or mirror in a frame, its middle at the origin, its back at z = 0."""
-    return {"panel": boxes(bsdf, ((0, 0, 0.0125), (width, height, 0.025)), tile=None),
-            "frame": boxes(border, *frame(width, height, 0.05, 0.04))}
+    return {
+        "panel": boxes(bsdf, ((0, 0, 0.0125), (width, height, 0.025)), tile=None),
+        "frame": boxes(border, *frame(width, height, 0.05, 0.04)),
+    }
 
 
 # ---- rooms ----------------------------------------------------------------------------------------------
 
 
-def room(size: Vec, floor: dict[str, Any], ceiling: dict[str, Any], walls: Sequence[dict[str, Any]],
-         floor_tile: float = 2.0) -> Shapes:
+def room(
+    size: Vec, floor: dict[str, Any], ceiling: dict[str, Any], walls: Sequence[dict[str, Any]], floor_tile: float = 2.0
+) -> Shapes:
     """Six quads that face inward, middle of the floor at the origin; walls: left, right, back, front."""
     x, y, z = size[0] / 2, size[1], size[2] / 2
     e = 0.01  # each quad reaches past the corners, so no ray slips through them
@@ -303,24 +328,40 @@ def demo_room() -> Shapes:
     wood = diffuse(texture(grain((0.42, 0.25, 0.13))))
     blue = diffuse(rgb(0.12, 0.24, 0.42))
     cream = diffuse(rgb(0.8, 0.72, 0.55))
-    check = diffuse({"type": "checkerboard", "color0": rgb(0.8, 0.6, 0.15), "color1": rgb(0.75, 0.72, 0.65),
-                     "to_uv": mi.ScalarTransform4f().scale([3, 3, 1])})
+    check = diffuse(
+        {
+            "type": "checkerboard",
+            "color0": rgb(0.8, 0.6, 0.15),
+            "color1": rgb(0.75, 0.72, 0.65),
+            "to_uv": mi.ScalarTransform4f().scale([3, 3, 1]),
+        }
+    )
     rug = diffuse(texture(carpet([(0.5, 0.08, 0.07), (0.75, 0.55, 0.25), (0.08, 0.1, 0.25)])))
     picture = diffuse(texture(landscape()))
     metal = {"type": "roughconductor", "material": "Al", "alpha": 0.2}
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.92, 0.92, 0.92)}
     glazed = rough_plastic(rgb(0.05, 0.35, 0.32), 0.1)
     glass = {"type": "dielectric", "int_ior": 1.5}
-    books = [(0.5, 0.08, 0.06), (0.1, 0.22, 0.45), (0.75, 0.6, 0.25), (0.1, 0.3, 0.15), (0.7, 0.68, 0.6),
-             (0.3, 0.12, 0.3), (0.1, 0.1, 0.12)]
+    books = [
+        (0.5, 0.08, 0.06),
+        (0.1, 0.22, 0.45),
+        (0.75, 0.6, 0.25),
+        (0.1, 0.3, 0.15),
+        (0.7, 0.68, 0.6),
+        (0.3, 0.12, 0.3),
+        (0.1, 0.1, 0.12),
+    ]
 
     lamp = area_light(1.0, 1.0, (5.8, 5.0, 4.1), paint)
     down = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
     lamp = {part: replace(s, mesh=s.mesh.copy().apply_transform(down)) for part, s in lamp.items()}
     dish = [(0, 0), (0.08, 0), (0.18, 0.07), (0.17, 0.075), (0.07, 0.015), (0, 0.015)]
     stand = boxes(wood, ((0, 0.28, 0), (0.28, 0.56, 0.28)))
-    dining = {**table(wood), "bowl": lathe(glazed, dish, (0.25, 0.74, 0.1)),
-              "cup": lathe(cream, [(0, 0), (0.04, 0), (0.045, 0.1), (0, 0.1)], (-0.35, 0.74, -0.15))}
+    dining = {
+        **table(wood),
+        "bowl": lathe(glazed, dish, (0.25, 0.74, 0.1)),
+        "cup": lathe(cream, [(0, 0), (0.04, 0), (0.045, 0.1), (0, 0.1)], (-0.35, 0.74, -0.15)),
+    }
     return {
         **room((5.0, 2.6, 4.0), boards, paint, [accent, cream, paper, paper]),
         **place(area_light(1.5, 1.2, (3.8, 4.5, 5.5), paint), "window", (-0.5, 1.5, -2.0)),
@@ -354,8 +395,14 @@ def mitsuba_scene(name: str) -> mi.Scene:
         props["mesh_bsdf"] = bsdfs[id(shape.bsdf)]
         if shape.emitter is not None:
             props["mesh_emitter"] = mi.load_dict(shape.emitter)
-        mesh = mi.Mesh(key, len(shape.mesh.vertices), len(shape.mesh.faces), props=props,
-                       has_vertex_normals=shape.smooth, has_vertex_texcoords=shape.uv is not None)
+        mesh = mi.Mesh(
+            key,
+            len(shape.mesh.vertices),
+            len(shape.mesh.faces),
+            props=props,
+            has_vertex_normals=shape.smooth,
+            has_vertex_texcoords=shape.uv is not None,
+        )
         mesh.set_id(key)
         params = mi.traverse(mesh)
         params["vertex_positions"] = np.ravel(shape.mesh.vertices).astype(np.float32)
