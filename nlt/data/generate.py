@@ -18,6 +18,8 @@ from tqdm import tqdm
 from nlt.data.spec import DatasetSpec, Shard
 from nlt.data.store import MANIFEST, missing_files, points_path, write_manifest, write_shard
 from nlt.errors import UserError
+from nlt.scenes.camera import Camera
+from nlt.scenes.state import rest_state, sample_view
 
 # Mitsuba's memory grows with every scene and state: a worker renders so many samples and ends.
 _SAMPLES_PER_WORKER = 1024
@@ -230,20 +232,25 @@ class SampleRenderer:
 
         return sample_points(self.scene, self.spec.points, self.spec.seed)
 
-    def sample(self, split: str, index: int, rest: bool = False) -> dict[str, np.ndarray]:
-        """One sample, all fields of its split. `rest`: in the rest state, for trying out the speed."""
-        from nlt.scenes.state import rest_state, sample_view
-
+    def place(self, split: str, index: int, rest: bool = False) -> Camera:
+        """Put the scene into the state of a sample and return the sample's camera."""
         spec = self.spec
         if rest:
             state = rest_state(self.description, spec.experiment)
         else:
             self._states = self._states or spec.states(self.index)
             state = self._states[split][index]
-        seeds = spec.seeds(split, self.index, index)
-        camera = sample_view(self.description, spec.resolution, np.random.default_rng(seeds.spawn(2)[1]))
-        noisy, noisy_input, half_a, half_b, photons = (int(s) for s in seeds.generate_state(5))
         self.scene.set_state(state)
+        rng = np.random.default_rng(spec.seeds(split, self.index, index).spawn(2)[1])
+        return sample_view(self.description, spec.resolution, rng)
+
+    def sample(self, split: str, index: int, rest: bool = False) -> dict[str, np.ndarray]:
+        """One sample, all fields of its split. `rest`: in the rest state, for trying out the speed."""
+        spec = self.spec
+        camera = self.place(split, index, rest)
+        state = self.scene.state
+        seeds = spec.seeds(split, self.index, index).generate_state(5)
+        noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds)
         moved = np.zeros((spec.sizes["M"], 3), np.float32)
         present = np.zeros(spec.sizes["M"], bool)
         moved[: len(state.present)], present[: len(state.present)] = state.translation, state.present

@@ -166,8 +166,18 @@ class ImageMetrics(nn.Module):
             self.feature_l1 = FeatureL1()
 
     @torch.no_grad()
-    def update(self, prediction: Tensor, reference_a: Tensor, reference_b: Tensor, exposure: Tensor) -> None:
-        """Add a batch: linear radiance (B, 3, H, W), W·sr⁻¹·m⁻², and the scenes' exposure (B,) or scalar."""
+    def update(
+        self,
+        prediction: Tensor,
+        reference_a: Tensor,
+        reference_b: Tensor,
+        exposure: Tensor,
+        of_reference: dict[str, Tensor] | None = None,
+    ) -> None:
+        """Add a batch: linear radiance (B, 3, H, W), W·sr⁻¹·m⁻², and the scenes' exposure (B,) or scalar.
+
+        `of_reference`: what `reference_features` gave for it, when several methods share a reference.
+        """
         f, a, b, shown, target = _domains(prediction, reference_a, reference_b, exposure)
         self.mse.update(shown, target)
         self.unbiased_mse.update(f, a, b)
@@ -175,10 +185,18 @@ class ImageMetrics(nn.Module):
         self.mssim.update(shown, target)
         if self.perceptual and (inception := load_inception(f.device)):
             # One pass for all perceptual metrics; prediction and reference apart to halve the memory.
-            of_prediction, of_reference = inception(shown), inception(target)
+            of_prediction, of_reference = inception(shown), of_reference or inception(target)
             self.feature_l1.update(of_prediction, of_reference)
             self.fid.update(of_prediction["pool"].double(), real=False)
             self.fid.update(of_reference["pool"].double(), real=True)
+
+    @staticmethod
+    @torch.no_grad()
+    def reference_features(reference_a: Tensor, reference_b: Tensor, exposure: Tensor) -> dict[str, Tensor] | None:
+        """Inception's features of a reference, for `update`; None without the weights."""
+        target = _domains(reference_a, reference_a, reference_b, exposure)[-1]
+        inception = load_inception(target.device)
+        return inception(target) if inception else None
 
     def compute(self) -> dict[str, Tensor]:
         """Scalars over all updates, of all processes, by the keys of `METRICS`."""

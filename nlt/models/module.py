@@ -99,6 +99,10 @@ class RenderingModule(L.LightningModule):
         """Fraction of the pixels that the stage "path_tracing" traces."""
         return 0.0
 
+    def mask(self, batch: Batch, height: int, width: int) -> Tensor:
+        """The pixels (B, 1, height, width) that the stage "path_tracing" traces; all, unless overridden."""
+        return torch.ones(len(batch["scene"]), 1, height, width, dtype=torch.bool, device=self.device)
+
     def transport(self, batch: Batch) -> Any:
         """Light transport: whatever `features` takes up again; None for a method without."""
         return None

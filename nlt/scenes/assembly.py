@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlt.errors import UserError
-from nlt.scenes.description import BUILTIN, MOVING_LIGHT, Movable, SceneDescription
+from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
 from nlt.scenes.lanes import is_jit
 from nlt.scenes.state import SceneState, rest_state
 
@@ -91,7 +91,7 @@ class Scene:
             if mesh.is_emitter():
                 parts[f"emitter_{name}"] = mesh
             else:
-                groups.setdefault(owner.get(name, "static"), {})[name] = mesh
+                groups.setdefault(owner.get(name, STATIC), {})[name] = mesh
         for key, members in groups.items():
             group = mi.load_dict({"type": "shapegroup", **members})
             parts[f"group_{key}"] = group
@@ -187,8 +187,8 @@ def _some(names: set[str]) -> str:
 
 
 def _facing_down(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes +z, a rectangle's normal, to -up."""
-    first = np.roll(up, 1)
+    """A rotation (3, 3) that takes +z, a rectangle's normal, to -up, and +x to the first horizontal axis."""
+    first = np.eye(3)[int(up[0] == 1)]
     return np.stack([first, np.cross(-up, first), -up], axis=1)
 
 

@@ -25,6 +25,7 @@ EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
 # Material type of a surface, by the lobes of its BSDF; the index into this tuple is what is stored.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
 MOVING_LIGHT = "moving_light"  # its name as a movable object, and its shape id
+STATIC = "static"  # the name of what never moves
 UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 BUILTIN = "builtin:"
 
@@ -41,7 +42,10 @@ class Movable:
 
 @dataclass(frozen=True)
 class MovingLight:
-    """The rectangular ceiling light of the dynamic-lights experiment; `box` (2, 3): its centre's positions."""
+    """The rectangular ceiling light of the dynamic-lights experiment; `box` (2, 3): its centre's positions.
+
+    `size` (2,) is along the two horizontal axes, in order.
+    """
 
     size: np.ndarray
     radiance: np.ndarray
@@ -172,14 +176,25 @@ def load_description(name: str) -> SceneDescription:
     if (camera[0] > camera[1]).any():
         raise UserError(f"{file}: camera: is empty: min is above max")
     objects = []
-    for key, value in dict(data.get("objects") or {}).items():
+    named = data.get("objects") or {}
+    if not isinstance(named, Mapping):
+        raise UserError(f"{file}: objects: must be a mapping from names to shapes and box, is {named!r}")
+    for key, value in named.items():
+        if key in (MOVING_LIGHT, STATIC):
+            raise UserError(f"{file}: objects.{key}: this name is taken; choose another name")
         section = _Section(file, f"objects.{key}", value, ("shapes", "box"))
-        objects.append(Movable(str(key), tuple(map(str, section.get("shapes"))), section.box("box") * scale))
+        shapes = section.get("shapes")
+        if not isinstance(shapes, list) or not shapes:
+            raise UserError(f"{file}: objects.{key}.shapes: must be a list of shape ids, is {shapes!r}")
+        objects.append(Movable(str(key), tuple(map(str, shapes)), section.box("box") * scale))
     light = None
     if data.get("moving_light") is not None:
         section = _Section(file, MOVING_LIGHT, data[MOVING_LIGHT], ("size", "radiance", "box"))
         size = section.positive("size", (2,)) * scale
-        light = MovingLight(size, section.numbers("radiance", (3,)), section.box("box") * scale)
+        radiance = section.numbers("radiance", (3,))
+        if (radiance < 0).any() or not radiance.any():
+            raise UserError(f"{file}: moving_light.radiance: must be above zero, is {radiance.tolist()}")
+        light = MovingLight(size, radiance, section.box("box") * scale)
     return SceneDescription(
         name=str(top.get("name", file.stem)),
         file=file,

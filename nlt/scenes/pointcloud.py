@@ -59,7 +59,8 @@ def material(bsdf: Any) -> str:
     """The entry of `MATERIALS` that describes a BSDF's lobes (opacity masks count as what they mask)."""
     flags = int(bsdf.flags())
     has = lambda *names: any(flags & int(getattr(mi.BSDFFlags, name)) for name in names)
-    if has("DeltaTransmission", "GlossyTransmission"):
+    # Thin glass lets light through unbent, and its flags say what those of a mirror behind an opacity mask say.
+    if has("DeltaTransmission", "GlossyTransmission") or bsdf.class_name() == "ThinDielectric":
         return "glass"
     specular = has("GlossyReflection", "DeltaReflection")
     if has("DiffuseReflection", "DiffuseTransmission"):

@@ -1,0 +1,79 @@
+"""The one entry point, `nlt`. Parsing only: whatever is heavy is imported inside its subcommand."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from nlt import __version__
+from nlt.errors import UserError
+
+_LIGHTNING = {
+    "fit": "train a method",
+    "validate": "validation metrics of a checkpoint",
+    "test": "all metrics of a checkpoint on the test split",
+    "predict": "images of a checkpoint for the test split",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command. Returns the exit code: 0, or 2 for a user's mistake, said in one line."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _run(arguments)
+    except UserError as error:
+        print(f"nlt: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("nlt: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments and arguments[0] in _LIGHTNING:
+        from nlt.training import run_lightning
+
+        run_lightning(arguments)
+        return 0
+    options = _parser().parse_args(arguments)
+    if options.command == "generate":
+        from nlt.data.generate import generate
+        from nlt.data.spec import load_spec
+
+        print(generate(*load_spec(options.config), workers=options.workers))
+    elif options.command == "compare":
+        from nlt.evaluation.compare import compare
+
+        compare(options.config, out=options.out, scale=options.scale, data=options.data, methods=options.methods)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="nlt", description="Learned light transport: data, training, comparison.")
+    parser.add_argument("--version", action="version", version=f"nlt {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
+    generate = commands.add_parser("generate", help="render a dataset; resumes, and does nothing if it is complete")
+    generate.add_argument("--config", action="append", required=True, help="YAML; later ones override earlier ones")
+    generate.add_argument("--workers", type=_positive, help="rendering processes (default: one per core)")
+    for name, text in _LIGHTNING.items():
+        # Handed to Lightning's own parser before this one sees it; here for the help.
+        commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")
+    compare = commands.add_parser("compare", help="a table of all methods: generates, trains, evaluates, times")
+    compare.add_argument("--config", required=True, help="a config of configs/compare, by name or path")
+    compare.add_argument("--out", help="where the results go (default: results/NAME)")
+    compare.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
+    compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
+    compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, is {text}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""The paper's published numbers and its names for the methods."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+@cache
+def paper() -> dict[str, Any]:
+    """The content of paper.yaml."""
+    return yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text())
+
+
+def label(method: str) -> str:
+    """The paper's name of a method; a method it lacks goes by its own."""
+    return paper()["labels"].get(method, method)
+
+
+def order(method: str) -> tuple[int, str]:
+    """Sort key: the paper's order, then the methods it lacks by name."""
+    known = list(paper()["labels"])
+    return (known.index(method) if method in known else len(known), method)
+
+
+def published(table: str | None, method: str) -> dict[str, float]:
+    """The paper's row of a method in "table1" or "table2", by column; empty where it has none."""
+    row = paper().get(table or "", {}).get(method)
+    return dict(zip(paper()["columns"], row, strict=True)) if row else {}

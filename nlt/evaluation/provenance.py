@@ -1,0 +1,58 @@
+"""Where numbers come from: command, commit, device, versions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nlt.evaluation.clock import FRAMES, WARM_UP
+from nlt.metrics.inception import find_weights
+from nlt.paths import PROJECT
+from nlt.rendering.variant import choose_variant
+
+_PACKAGES = ("nlt", "torch", "lightning", "torchmetrics", "mitsuba", "drjit", "numpy", "safetensors")
+
+
+def manifest(start: float, device: torch.device) -> dict[str, Any]:
+    """What a result file says of its origin. `start`: when the command began, seconds since the epoch."""
+    variant, weights = choose_variant(), find_weights()
+    return {
+        "command": shlex.join(["nlt", *sys.argv[1:]]),
+        "commit": _git("rev-parse", "HEAD"),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+        "threads": torch.get_num_threads(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "mitsuba_variant": f"{variant.name}: {variant.reason}",
+        "inception_weights": Path(weights).name if weights else None,
+        "clock": {"batch": 1, "warm_up_frames": WARM_UP, "timed_frames": FRAMES, "precision": "float32"},
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
+        "wall_time_s": round(time.time() - start, 1),
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line] if (
+        cpuinfo.exists()
+    ) else []  # fmt: skip
+    return f"CPU, {names[0] if names else platform.processor()}, {os.cpu_count()} cores"
