@@ -20,6 +20,7 @@ from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, lo
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 1  # of the files on disk
+_DRAWS = 1000  # of a state that no other split has
 
 
 @dataclass
@@ -137,8 +138,12 @@ class DatasetSpec:
                 rng = np.random.default_rng(self.seeds(split, scene, index).spawn(1)[0])
                 state = sample_state(description, self.experiment, rng)
                 # With every object removed, two states are equal.
-                while len(state.present) and taken.setdefault(state.key, split) != split:
+                for _ in range(_DRAWS):
+                    if not len(state.present) or taken.setdefault(state.key, split) == split:
+                        break
                     state = sample_state(description, self.experiment, rng)
+                else:
+                    raise UserError(f"{description.file}: objects: too few different states for three splits; widen a box")
                 states[split].append(state)
         return states
 

@@ -5,7 +5,6 @@ Everything comes back as numpy arrays in metres, world coordinates and linear, u
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -36,6 +35,7 @@ class Renderer:
         self._radiance = freeze(_radiance)
         self._gbuffer = freeze(_gbuffer)
         self._photons = [freeze(_photons) for _ in self.emitters]
+        self._powers: dict[tuple[bool, ...], np.ndarray] = {}  # by scene.lit
 
     def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
         """Path-traced radiance; traces the pixels asked for and no others.
@@ -114,11 +114,14 @@ class Renderer:
         image = lambda a: np.where(valid[:, None], a, 0).T.reshape(-1, camera.height, camera.width)
         return {"depth": image(depth[:, None]).astype(np.float32), "normal": image(normal), "albedo": image(albedo)}
 
-    @functools.cached_property
+    @property
     def powers(self) -> np.ndarray:
         """(E,) mean power over RGB of each emitter in scene units: the mean weight of its sampled rays."""
-        uniform = np.random.default_rng(0).random((_POWER_SAMPLES, 5))
-        return np.array([self._cast(k, uniform)[2].mean() for k in range(len(self.emitters))])
+        if self.scene.lit not in self._powers:
+            uniform = np.random.default_rng(0).random((_POWER_SAMPLES, 5))
+            powers = [self._cast(k, uniform)[2].mean() for k in range(len(self.emitters))]
+            self._powers[self.scene.lit] = np.array(powers)
+        return self._powers[self.scene.lit]
 
     def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
         lanes = {

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
+from nlt.errors import UserError
+
 log = logging.getLogger(__name__)
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
@@ -43,7 +45,10 @@ def use_variant() -> Variant:
 def choose_variant() -> Variant:
     """The first variant that works. A wrong LLVM aborts the process that loads it, so subprocesses try."""
     if "NLT_VARIANT" in os.environ:
-        return Variant(os.environ["NLT_VARIANT"], "set by NLT_VARIANT")
+        name = os.environ["NLT_VARIANT"]
+        if name not in VARIANTS:
+            raise UserError(f"NLT_VARIANT: must be one of {', '.join(VARIANTS)} or unset, is {name!r}")
+        return Variant(name, "set by NLT_VARIANT")
     failed = []
     for name in VARIANTS[:-1]:
         for library in _llvm_libraries() if name.startswith("llvm") else [None]:

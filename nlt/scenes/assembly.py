@@ -107,11 +107,12 @@ class Scene:
         self._instances = {m.name: f"instance_{m.name}.to_world" for m in self.movables if m.name in groups}
         self._moving_meshes = {
             m.name: {
-                # Mitsuba names a plain mesh's parameters by its own id.
                 key: np.array(self._parameters[key]).reshape(-1, 3)
                 for shape in m.shapes
                 if shape in meshes and meshes[shape].is_emitter()
-                for key in [f"{shape}.vertex_positions"]
+                # Mitsuba names a mesh's parameters by its key in the dict, or by its own id if the XML gives one.
+                for key in (f"emitter_{shape}.vertex_positions", f"{shape}.vertex_positions")
+                if key in self._parameters
             }
             for m in self.movables
         }
@@ -169,16 +170,29 @@ class Scene:
             for key, rest in self._moving_meshes[movable.name].items():
                 centre = self._centre(movable) * units
                 moved = (rest - centre) * scale + centre + offset
-                self._parameters[key] = moved.ravel() if is_jit() else moved.ravel().tolist()
+                self._parameters[key] = _owned(moved.ravel()) if is_jit() else moved.ravel().tolist()
         if len(self._parameters):
             self._parameters.update()
             if is_jit():
                 # Otherwise the transforms are literals, and every state compiles its kernels anew.
                 dr.make_opaque({key: self._parameters[key] for key in self._parameters.keys()})  # noqa: SIM118
 
+    @property
+    def lit(self) -> tuple[bool, ...]:
+        """Which of the movable objects that emit light are present: what the emitters' powers depend on."""
+        present = zip(self.movables, self.state.present, strict=True)
+        return tuple(bool(there) for movable, there in present if self._moving_meshes[movable.name])
+
     def _centre(self, movable: Movable) -> np.ndarray:
         vertices = np.concatenate([self.shapes[name].vertices for name in movable.shapes])
         return (vertices.min(0) + vertices.max(0)) / 2
+
+
+def _owned(values: np.ndarray) -> Any:
+    """An array in memory of Dr.Jit's own: with numpy's, Embree is seen to read freed memory under frozen kernels."""
+    array = mi.Float(values.astype(np.float32)) + dr.opaque(mi.Float, 0)
+    dr.eval(array)
+    return array
 
 
 def _some(names: set[str]) -> str:

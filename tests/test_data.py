@@ -1,0 +1,480 @@
+"""Generated datasets: complete, of the declared form, the same bytes however often interrupted, strictly checked."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from conftest import first_hit, demo_meshes, write_yaml
+
+from nlt.data import generate as generation
+from nlt.data import store
+from nlt.data.datamodule import EpochSampler, LightTransportDataModule, LightTransportDataset
+from nlt.data.generate import generate
+from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
+from nlt.data.spec import DatasetSpec
+from nlt.errors import UserError
+from nlt.models.projection import visible_pixels
+from nlt.paths import CONFIGS, PROJECT, scenes_root
+from nlt.scenes.assembly import Scene
+from nlt.scenes.description import load_description
+from nlt.scenes.pointcloud import sample_points
+from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
+
+SIZE = dict(resolution=16, train=12, val=4, test=4, points=200, photons=200, reference_spp=2, shard_size=4)
+
+
+def spec_of(*scenes, **more):
+    return DatasetSpec(list(scenes) or ["demo_room"], **{**SIZE, **more})
+
+
+def content(directory):
+    """Every file's bytes."""
+    return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory, variant):
+    return generate(spec_of(), tmp_path_factory.mktemp("data"), workers=1)
+
+
+@pytest.fixture
+def damaged(dataset, tmp_path):
+    """A copy to harm, under a root of its own."""
+    return Path(shutil.copytree(dataset, tmp_path / dataset.name))
+
+
+def samples_of(directory, split):
+    spec = spec_of()
+    return [dict(LightTransportDataset(directory, spec, split)[k]) for k in range(spec.count(split))]
+
+
+# ---- form -----------------------------------------------------------------------------------------------
+
+
+def test_fields(dataset):
+    """Every array on disk is as FIELDS and POINT_FIELDS say."""
+    spec, reader = spec_of(), store.ShardReader()
+    for shard in spec.shards():
+        fields = {n: f for n, f in FIELDS.items() if shard.split != "train" or not f.reference_only}
+        for row in range(shard.stop - shard.start):
+            sample = reader.read(dataset / shard.name, row, fields)
+            for name, field in fields.items():
+                assert sample[name].shape == field.resolve(spec.sizes) and sample[name].dtype == field.dtype, name
+                assert np.isfinite(sample[name]).all(), name
+    points = store.read_points(store.points_path(dataset, 0))
+    for name, field in POINT_FIELDS.items():
+        assert points[name].shape == field.resolve(spec.sizes) and points[name].dtype == field.dtype, name
+
+
+def test_samples_differ_and_mean_what_they_say(dataset):
+    samples = samples_of(dataset, "test") + samples_of(dataset, "train")
+    for name in ("noisy", "noisy_input", "depth", "world_to_view", "photon_origin", "translation"):
+        values = [s[name].numpy().tobytes() for s in samples]
+        assert len(set(values)) == len(values), name
+    for s in samples:
+        assert not torch.equal(s["noisy"], s["noisy_input"])
+        assert (s["translation"][~s["present"]] == 0).all() and (s["photon_hit"][~s["photon_valid"]] == 0).all()
+        # The closed room's photons all carry the light's power.
+        power = torch.tensor([18.0, 16.8, 15.0]) * torch.pi
+        assert torch.allclose(s["photon_flux"].sum(0), power, rtol=1e-3)
+    for s in samples[:4]:
+        assert not torch.equal(s["reference_a"], s["reference_b"])
+
+
+def test_nothing_is_pickled(dataset):
+    assert {Path(name).suffix for name in content(dataset)} == {".json", ".safetensors"}
+    for name, data in content(dataset).items():
+        if name.endswith(".safetensors"):
+            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+            assert all(set(v) == {"dtype", "shape", "data_offsets"} for v in header.values())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"resolution": 0}, {"train": 0}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
+     {"experiment": "moving"}, {"scenes": []}, {"scenes": "demo_room"}, {"reference_spp": True}],
+    ids=str,
+)  # fmt: skip
+def test_spec_refused(change):
+    with pytest.raises(UserError, match=f"data.dataset.{next(iter(change))}"):
+        DatasetSpec(**{"scenes": ["demo_room"], **SIZE, **change})
+
+
+# ---- splits ---------------------------------------------------------------------------------------------
+
+
+def states_by_split(spec):
+    return {split: {s.key for s in states} for split, states in spec.states(0).items()}
+
+
+def test_no_state_in_two_splits(tmp_path):
+    """Also where a fifth of all states is the same: one object, removed."""
+    objects = {"rug": {"shapes": ["rug"], "box": [[-0.1, 0, 0], [0.1, 0, 0]]}}
+    file = write_yaml(tmp_path / "scene.yaml", objects=objects)
+    for spec in (spec_of(train=300, val=40, test=40), spec_of(str(file), experiment="fixed_lights", train=300, val=40)):
+        states = spec.states(0)
+        assert {k: len(v) for k, v in states.items()} == {s: spec.count(s) for s in SPLITS}
+        keys = states_by_split(spec)
+        assert not (keys["train"] & keys["val"] | keys["train"] & keys["test"] | keys["val"] & keys["test"])
+    assert any(not s.present.any() for split in states.values() for s in split), "nothing was forced"
+
+
+def test_too_few_states_refused(tmp_path):
+    """An object that can only be there or not has two states: not enough for three splits."""
+    file = write_yaml(tmp_path / "scene.yaml", objects={"rug": {"shapes": ["rug"], "box": [[0, 0, 0], [0, 0, 0]]}})
+    with pytest.raises(UserError, match=r"scene.yaml.*states"):
+        spec_of(str(file), experiment="fixed_lights", train=100, val=20, test=20).states(0)
+
+
+# ---- determinism and interruption -----------------------------------------------------------------------
+
+
+def test_same_bytes_twice(dataset, tmp_path):
+    again = generate(spec_of(), tmp_path, workers=2)
+    assert content(again) == content(dataset) and again.name == dataset.name
+    before = {p: p.stat().st_mtime_ns for p in again.rglob("*")}
+    generate(spec_of(), tmp_path, workers=1)
+    assert {p: p.stat().st_mtime_ns for p in again.rglob("*")} == before, "a complete dataset is left alone"
+    assert spec_of(seed=1).directory("x") != spec_of().directory("x")
+
+
+def test_killed_and_resumed(dataset, tmp_path):
+    """kill -9 of the whole process group once a shard is there, then again: as if nothing had happened."""
+    code = (
+        "import sys; from pathlib import Path; from nlt.data.generate import generate\n"
+        "from nlt.data.spec import DatasetSpec\n"
+        f"generate(DatasetSpec(['demo_room'], **{SIZE!r}), Path(sys.argv[1]), workers=1)\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], cwd=PROJECT, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    directory = spec_of().directory(tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(directory.glob("*/*.safetensors")):
+        assert child.poll() is None and time.monotonic() < deadline
+        time.sleep(0.001)
+    os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+    done = {p: p.stat().st_mtime_ns for p in directory.glob("*/*.safetensors")}
+    assert 0 < len(done) < len(spec_of().shards()), "killed too late to prove anything"
+    leftover = directory / "train" / f".000-0000000.safetensors.{child.pid}.tmp"  # as a kill within a write leaves
+    leftover.parent.mkdir(exist_ok=True)
+    leftover.write_bytes(b"half")
+    generate(spec_of(), tmp_path, workers=1)
+    assert content(directory) == content(dataset)
+    assert {p: p.stat().st_mtime_ns for p in done} == done
+
+
+_worker = generation._worker
+
+
+def _killed_once(spec, directory, job, *rest):
+    """A worker that is killed after its first shard, once."""
+    marker = directory.parent / "killed"
+    if marker.exists():
+        return _worker(spec, directory, job, *rest)
+    marker.touch()
+    _worker(spec, directory, (job[0], job[1][:1], False), *rest)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _always_killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_killed_worker(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "_worker", _killed_once)
+    assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
+    assert (tmp_path / "killed").exists()
+
+
+def test_worker_killed_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "_worker", _always_killed)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    with pytest.raises(UserError, match=r"demo_room.*worker died twice"):
+        generate(spec_of(), tmp_path, workers=1)
+
+
+# ---- damage ---------------------------------------------------------------------------------------------
+
+
+def module_of(directory, **more):
+    module = LightTransportDataModule(spec_of(), str(directory.parent), batch_size=4, workers=0, **more)
+    module.setup("fit")
+    return module
+
+
+SHARD = "test/000-0000000.safetensors"
+
+
+def test_truncated_and_flipped(damaged):
+    path = damaged / SHARD
+    whole = path.read_bytes()
+    for cut in (0, 5, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(UserError, match=SHARD):
+            module_of(damaged).split("test")[0]
+    header = int.from_bytes(whole[:8], "little")
+    rng = np.random.default_rng(0)
+    for at in rng.integers(8 + header, len(whole), 20):  # of every array's bytes, and of the checksums themselves
+        broken = bytearray(whole)
+        broken[at] ^= 16
+        path.write_bytes(broken)
+        with pytest.raises(UserError, match=rf"{SHARD}: damaged.*delete"):
+            [module_of(damaged).split("test")[k] for k in range(4)]
+    path.write_bytes(whole)
+    module_of(damaged).split("test")[0]
+
+
+def test_missing_files(damaged):
+    for name in (SHARD, "points-000.safetensors"):
+        (damaged / name).rename(damaged / "aside")
+        with pytest.raises(UserError, match=rf"incomplete.*{Path(name).name}"):
+            module_of(damaged)
+        (damaged / "aside").rename(damaged / name)
+    dataset = module_of(damaged).split("test")
+    (damaged / SHARD).unlink()  # after it was checked
+    with pytest.raises(UserError, match=rf"{SHARD}: missing"):
+        dataset[0]
+
+
+def test_manifest(damaged, tmp_path):
+    path = damaged / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(path.read_text()[:50])
+    with pytest.raises(UserError, match=r"manifest.json: damaged"):
+        module_of(damaged)
+    path.write_text(json.dumps({**manifest, "scenes": {"demo_room": "0"}}))
+    with pytest.raises(UserError, match=r"manifest.json: scenes"):
+        module_of(damaged)
+    path.unlink()
+    with pytest.raises(UserError, match=r"no dataset here.*nlt generate"):
+        module_of(damaged)
+
+
+# ---- a full disk ----------------------------------------------------------------------------------------
+
+
+def test_full_disk_within_a_write(tmp_path, monkeypatch):
+    path = tmp_path / "shard"
+    path.write_bytes(b"before")
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match=r"shard: no space left on disk"):
+        store.write_bytes(path, b"after")
+    assert [p.name for p in tmp_path.iterdir()] == ["shard"] and path.read_bytes() == b"before"
+
+
+def test_full_disk_at_the_start(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
+    with pytest.raises(UserError, match=r"no space left on disk.*GB"):
+        generate(spec_of(), tmp_path, workers=1)
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
+# ---- batches --------------------------------------------------------------------------------------------
+
+
+def test_batch(dataset):
+    module = module_of(dataset)
+    for split, loader in (("train", module.train_dataloader()), ("test", module.test_dataloader())):
+        batch = next(iter(loader))
+        fields = {**spec_of().fields(split), **BATCH_FIELDS}
+        assert batch.keys() == fields.keys()
+        for name, field in fields.items():
+            assert batch[name].shape == (4, *field.resolve(spec_of().sizes)), name
+            kind = str(batch[name].dtype).removeprefix("torch.")
+            assert kind == field.dtype.replace("float16", "float32"), name
+
+
+def test_points_and_directions_of_a_batch(dataset, demo):
+    points = store.read_points(store.points_path(dataset, 0))
+    for sample in samples_of(dataset, "test"):
+        for n in range(200):
+            m = points["object"][n]
+            offset = sample["translation"][m].numpy() if m >= 0 else np.zeros(3)
+            assert np.allclose(sample["point_position"][n].numpy(), points["position"][n] + offset, atol=1e-6)
+            assert bool(sample["point_visible"][n]) == (m < 0 or bool(sample["present"][m]))
+        # Pixel centres, pushed through K and T by hand, come back.
+        world_to_view, matrix = sample["world_to_view"].double(), sample["camera_matrix"].double()
+        view = torch.einsum("ij,jhw->ihw", world_to_view[:3, :3], sample["view_direction"].double())
+        pixel = torch.einsum("ij,jhw->ihw", matrix, view / view[2])
+        rows, columns = torch.meshgrid(torch.arange(16.0), torch.arange(16.0), indexing="ij")
+        assert torch.allclose(pixel[:2], torch.stack([columns, rows]).double() + 0.5, atol=1e-4)
+        assert sample["exposure"] == demo.exposure and sample["scene"] == 0
+
+
+def test_reads_only_what_is_asked_for(dataset, monkeypatch):
+    asked = []
+    read = store.ShardReader.read
+    monkeypatch.setattr(
+        store.ShardReader, "read", lambda self, path, row, fields: asked.append(set(fields)) or read(self, path, row, fields)
+    )
+    spec = spec_of()
+    for inputs, split, expected, given in (
+        ({"depth"}, "train", {"depth", "noisy"}, {"depth", "noisy"}),
+        ({"albedo"}, "test", {"albedo", "noisy", "reference_a", "reference_b"}, None),
+        ({"view_direction"}, "train", {"noisy", "camera_matrix", "world_to_view"}, None),
+        ({"point_position"}, "train", {"noisy", "translation", "present"}, None),
+    ):
+        chosen = LightTransportDataset(dataset, spec, split, inputs)
+        asked.clear()
+        sample = chosen[0]
+        assert asked == [expected] and set(inputs) <= set(sample)
+        if given:
+            assert set(sample) == given | {"scene", "index", "exposure"}
+
+
+@pytest.mark.parametrize("inputs", [{"point_material"}, {"point_albedo"}, {"point_emission"}, {"point_visible"}])
+def test_every_point_field_alone(dataset, inputs):
+    alone = LightTransportDataset(dataset, spec_of(), "test", inputs)[1]
+    full = LightTransportDataset(dataset, spec_of(), "test")[1]
+    assert all(torch.equal(alone[name], full[name]) for name in inputs)
+
+
+def test_epoch_sampler():
+    ranks = [EpochSampler(23, rank, 2, shuffle=False, seed=0) for rank in (0, 1)]
+    assert sorted([*ranks[0], *ranks[1]]) == list(range(23)) and [len(r) for r in ranks] == [12, 11]
+
+    orders = []
+    for epoch in (0, 1, 0):
+        parts = []
+        for rank in (0, 1):
+            sampler = EpochSampler(23, rank, 2, shuffle=True, seed=5)
+            sampler.set_epoch(epoch)
+            parts.append(list(sampler))
+            assert len(parts[-1]) == len(sampler) == 11
+        assert not set(parts[0]) & set(parts[1])
+        orders.append(parts)
+    assert orders[0] == orders[2] != orders[1] and orders[0][0] != sorted(orders[0][0])
+    assert list(EpochSampler(23, 0, 2, True, 6)) != orders[0][0]
+
+
+def test_loader_errors(dataset):
+    module = LightTransportDataModule(spec_of(), str(dataset.parent), batch_size=13, workers=0)
+    module.setup("fit")
+    with pytest.raises(UserError, match=r"batch_size: 13 .* 12"):
+        module.train_dataloader()
+    with pytest.raises(UserError, match="batch_size"):
+        LightTransportDataModule(spec_of(), batch_size=0)
+    module.spec.val = 0
+    with pytest.raises(UserError, match=r"dataset.val: is 0"):
+        module.val_dataloader()
+
+
+def test_two_scenes(tmp_path):
+    """Each scene has its index, its exposure and its points; a scene with fewer objects is padded."""
+    one = write_yaml(tmp_path / "one.yaml", name="one", exposure=2.0)
+    objects = {"rug": {"shapes": ["rug"], "box": [[-0.1, 0, 0], [0.1, 0, 0]]}}
+    two = write_yaml(tmp_path / "two.yaml", name="two", exposure=0.5, objects=objects)
+    more = dict(experiment="fixed_lights", train=2, val=1, test=1, shard_size=2)
+    spec = spec_of(str(one), str(two), **more)
+    generate(spec, tmp_path, workers=1)
+    module = LightTransportDataModule(spec, str(tmp_path), batch_size=4, workers=0)
+    module.setup("fit")
+    (batch,) = module.train_dataloader()
+    order = batch["index"].argsort()
+    assert batch["scene"][order].tolist() == [0, 0, 1, 1] and batch["exposure"][order].tolist() == [2, 2, 0.5, 0.5]
+    assert batch["translation"].shape == (4, 1, 3) and not batch["present"][order][:2].any()
+    assert module.num_scenes == 2 and "one+two" in str(module.directory)
+
+
+# ---- points against the renderer ------------------------------------------------------------------------
+
+
+def shares(description, experiment, resolution, views, free, state_of):
+    """Of the points in view: kept though free, kept though occluded; by our rule and by the nearest pixel's depth.
+
+    `free(state, origin, points)` (n,) bool says independently which points the origin sees.
+    """
+    from nlt.rendering.renderer import Renderer
+
+    scene = Scene(description, experiment)
+    renderer, points = Renderer(scene), sample_points(scene, 1500, 0)
+    counts = np.zeros(6)
+    for k in range(views):
+        state = state_of(k)
+        scene.set_state(state)
+        camera = sample_view(description, resolution, np.random.default_rng([k, 3]))
+        offset = np.append(state.translation, np.zeros((1, 3), np.float32), 0)[points["object"]]
+        present = np.append(state.present, True)[points["object"]]
+        position = points["position"] + offset
+        depth = renderer.gbuffer(camera)["depth"]
+        pixels = visible_pixels(
+            *(torch.from_numpy(a)[None] for a in (position, present, camera.matrix, camera.world_to_view, depth))
+        )[0].numpy()
+        kept = pixels < resolution**2
+        view = (camera.world_to_view[:3, :3] @ position.T).T.astype(float) + camera.world_to_view[:3, 3]
+        xy = (view @ camera.matrix.T.astype(float))[:, :2] / view[:, 2:]
+        inside = present & (view[:, 2] > 0) & (xy >= 0).all(1) & (xy < resolution).all(1)
+        assert (inside | ~kept).all()
+        column, row = np.where(inside, xy.T, 0).astype(int)
+        naive = inside & (view[:, 2] <= depth[0, row, column] * (1 + 1e-3))
+        seen = np.zeros(len(position), bool)
+        seen[inside] = free(state, camera.position, position[inside].astype(float))
+        hidden = inside & ~seen
+        counts += [seen.sum(), (seen & kept).sum(), (seen & naive).sum(),
+                   hidden.sum(), (hidden & kept).sum(), (hidden & naive).sum()]  # fmt: skip
+    seen, kept, naive, hidden, leaked, naive_leaked = counts
+    return {"kept": kept / seen, "leaked": leaked / hidden, "naive_kept": naive / seen,
+            "naive_leaked": naive_leaked / hidden, "seen": seen, "hidden": hidden}  # fmt: skip
+
+
+def by_triangles(triangles, origin, points):
+    """In float64, that nothing lies between."""
+    direction = points - origin
+    t, _, _ = first_hit(triangles, np.tile(origin, (len(points), 1)), direction)
+    return t > 1 - 1e-4
+
+
+@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.8, 0.2), (128, 0.8, 0.2)])
+def test_projection_sees_what_the_camera_sees(demo, resolution, least, most):
+    def free(state, origin, points):
+        meshes = demo_meshes(demo, "fixed_lights", state)
+        return by_triangles(np.concatenate([v[s.mesh.faces] for s, v in meshes.values()]), origin, points)
+
+    state_of = lambda k: sample_state(demo, "fixed_lights", np.random.default_rng([k, 4]))
+    result = shares(demo, "fixed_lights", resolution, 3, free, state_of)
+    print(resolution, result)
+    assert result["seen"] > 300 and result["hidden"] > 300
+    assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]
+
+
+@pytest.mark.skipif(
+    not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}"
+)
+@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.8, 0.2), (128, 0.8, 0.2)])
+def test_projection_in_the_living_room(resolution, least, most):
+    description = load_description("living-room")
+    plain = mi.load_file(str(description.path), optimize=False)
+    scene = Scene(description, "fixed_lights")
+    assert {s.id() for s in plain.shapes()} == set(scene.shapes)
+    jit = mi.variant() != "scalar_rgb"
+
+    def free(state, origin, points):
+        direction = points - origin
+        if jit:
+            ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(direction.T.astype(np.float32)), 1 - 1e-3, 0, [])
+            return ~np.array(plain.ray_test(ray))
+        rays = [mi.Ray3f(origin.tolist(), d.tolist(), 1 - 1e-3, 0, []) for d in direction]
+        return ~np.array([plain.ray_test(ray) for ray in rays])
+
+    result = shares(description, "fixed_lights", resolution, 3, free, lambda k: rest_state(description, "fixed_lights"))
+    print(resolution, result)
+    assert result["seen"] > 300 and result["hidden"] > 300
+    assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]

@@ -1,0 +1,496 @@
+"""Rendering against plain Mitsuba scenes, float64 geometry and analytic light, each by a statistical test."""
+
+import os
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from conftest import LIGHT, demo_meshes, first_hit, plain_scene, write_room, write_yaml
+from scipy import stats
+
+from nlt.errors import UserError
+from nlt.rendering import renderer as renderer_module
+from nlt.rendering import variant as variant_module
+from nlt.rendering.renderer import Renderer
+from nlt.scenes.assembly import Scene
+from nlt.scenes.camera import Camera
+from nlt.scenes.description import MOVING_LIGHT, load_description
+from nlt.scenes.lanes import is_jit
+from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
+
+# What mi.render's moments are in.
+XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+ALPHA = 1e-4  # of each test, after Bonferroni's correction
+
+
+def moments(plain, camera, spp, seed):
+    """Mitsuba's own mean and variance per path, XYZ (3, H, W), of the view of a plain scene."""
+    to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f(to_world)
+    sensor = mi.load_dict({
+        "type": "perspective", "fov": camera.fov, "near_clip": 1e-3, "to_world": to_world, "film": film,
+    })  # fmt: skip
+    integrator = mi.load_dict({"type": "moment", "path": {"type": "path", "max_depth": -1}})
+    image = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=spp, seed=seed)), 2, 0)
+    mean, square = image[3:6].astype(float), image[6:9].astype(float)
+    return mean, (square - mean**2) * spp / (spp - 1)
+
+
+def samples_of(renderer, camera, spp, seeds, pixels=None):
+    """(seeds, 3, H, W) or (seeds, 3, n) XYZ of our renderer."""
+    images = np.stack([renderer.radiance(camera, spp, seed, pixels) for seed in seeds]).astype(float)
+    return np.einsum("xc,nc...->nx...", XYZ, images)
+
+
+def p_value(samples, mean, variance):
+    """Of the worst of all entries and of their sum, that the samples' mean is `mean`, itself of that variance."""
+    count = len(samples)
+    ours, theirs = samples.var(0, ddof=1) / count, variance
+    error = samples.mean(0) - mean
+    spread = np.sqrt(ours + theirs + 1e-10 * mean**2)  # a pixel full of light has no noise, only rounding
+    each = 2 * stats.t.sf(np.abs(error) / spread, count - 1)
+    total = samples.reshape(count, -1).sum(1)
+    z = (total.mean() - mean.sum()) / np.sqrt(total.var(ddof=1) / count + theirs.sum())
+    return min(1.0, each.min() * (each.size + 1), 2 * stats.t.sf(abs(z), count - 1) * (each.size + 1))
+
+
+def away(experiment, demo):
+    """A state with the objects at their boxes' ends, the sofa, the lamp and the picture gone."""
+    movables = demo.movables(experiment)
+    present = np.array([m.name not in ("sofa", "lamp", "picture") for m in movables])
+    translation = np.stack([m.box[k % 2] for k, m in enumerate(movables)]) * present[:, None]
+    return SceneState(translation.astype(np.float32), present)
+
+
+# ---- radiance -------------------------------------------------------------------------------------------
+
+
+def check_states(renderer, demo, experiment):
+    """States, resolutions and spp one after the other, each against a scene built for it alone."""
+    rng = np.random.default_rng(0)
+    other = sample_state(demo, experiment, np.random.default_rng(11))
+    cases = [(rest_state(demo, experiment), 12, 4), (away(experiment, demo), 16, 2), (other, 16, 3)]
+    previous = None
+    for k, (state, resolution, spp) in enumerate(cases):
+        camera = sample_view(demo, resolution, rng)
+        renderer.scene.set_state(state)
+        ours = samples_of(renderer, camera, spp, range(100 * k, 100 * k + 80))
+        mean, variance = moments(plain_scene(demo, experiment, state), camera, 512, k)
+        assert p_value(ours, mean, variance / 512) > ALPHA, f"state {k}"
+        if k == 1:
+            mean, variance = moments(plain_scene(demo, experiment, previous), camera, 512, k)
+            assert p_value(ours, mean, variance / 512) < 1e-6, f"the test cannot tell state {k} from the last one"
+        previous = state
+
+
+def test_states_with_the_moving_light(renderer, demo):
+    check_states(renderer, demo, "moving_lights")
+
+
+def test_states_with_own_lights(demo):
+    check_states(Renderer(Scene(demo, "fixed_lights")), demo, "fixed_lights")
+
+
+def test_two_scenes_at_once(renderer, demo):
+    """Moving one scene's objects leaves another scene alone, and each keeps its own kernels."""
+    second = Renderer(Scene(demo, "moving_lights"))
+    camera = sample_view(demo, 12, np.random.default_rng(2))
+    states = [rest_state(demo, "moving_lights"), away("moving_lights", demo)]
+    references = [moments(plain_scene(demo, "moving_lights", s), camera, 512, 5) for s in states]
+    for r, state in zip((renderer, second), states, strict=True):
+        r.scene.set_state(state)
+    for k, r in enumerate((renderer, second, renderer)):
+        mean, variance = references[k % 2]
+        assert p_value(samples_of(r, camera, 4, range(50)), mean, variance / 512) > ALPHA
+
+
+def test_loaded_emitter_that_moves(tmp_path):
+    """The light of an XML scene is moved and removed: photons leave from where it is, with its power, or not at all."""
+    box = [[-0.5, -0.5, 0], [0.5, 0, 0]]
+    file = write_room(tmp_path, objects={"lamp": {"shapes": ["lamp"], "box": box}})
+    scene = Scene(load_description(str(file)), "fixed_lights")
+    renderer = Renderer(scene)
+    scene.set_state(SceneState(np.array([[0.4, -0.3, 0]], np.float32), np.array([True])))
+    photons = renderer.photons(500, 0)
+    half = LIGHT["size"][0] / 2
+    assert np.allclose(photons["photon_origin"][:, 1], LIGHT["height"] - 0.3, atol=1e-3)
+    assert stats.kstest(photons["photon_origin"][:, 0], stats.uniform(0.4 - half, 2 * half).cdf).pvalue > 1e-3
+    power = np.pi * np.prod(LIGHT["size"]) * np.array(LIGHT["radiance"])
+    assert np.allclose(photons["photon_flux"].sum(0, dtype=float), power, rtol=1e-4)
+    scene.set_state(SceneState(np.zeros((1, 3), np.float32), np.array([False])))
+    assert renderer.photons(500, 0)["photon_flux"].sum() < 1e-9 * power.sum()
+
+
+@pytest.mark.parametrize("movable", ["window", "bulb"])
+def test_emitter_that_moves(tmp_path, movable):
+    """An emitting object is moved, removed, and put back."""
+    shapes = {"window": ["window_panel"], "bulb": ["ceiling_lamp_panel", "ceiling_lamp_frame"]}[movable]
+    objects = {movable: {"shapes": shapes, "box": [[-0.3, -0.3, 0], [0.3, 0, 0.3]]}}
+    description = load_description(str(write_yaml(tmp_path / "scene.yaml", objects=objects)))
+    renderer = Renderer(Scene(description, "fixed_lights"))
+    camera = sample_view(description, 12, np.random.default_rng(3))
+    areas = {"window_panel": (1.5 * 1.2, (3.8, 4.5, 5.5)), "ceiling_lamp_panel": (1.0, (5.8, 5.0, 4.1))}
+    references = []
+    # Removed first: what is learnt of the emitters' power then must not be kept. Often, for moved meshes whose
+    # memory Dr.Jit does not own were read after it was freed, every now and then.
+    for k, (offset, present) in enumerate([((0, 0, 0), False), ((-0.2, -0.3, 0.2), True)] * 4):
+        state = SceneState(np.array([offset], np.float32), np.array([present]))
+        renderer.scene.set_state(state)
+        if k < 2:
+            mean, variance = moments(plain_scene(description, "fixed_lights", state), camera, 512, k)
+            references.append((mean, variance / 512))
+        assert p_value(samples_of(renderer, camera, 4, range(60)), *references[k % 2]) > ALPHA
+        photons = renderer.photons(1000, k)
+        lit = [v for name, v in areas.items() if present or name not in shapes]
+        power = sum(np.pi * area * np.array(radiance) for area, radiance in lit)
+        assert np.allclose(photons["photon_flux"].sum(0, dtype=float), power, rtol=2e-2)
+        if present:
+            flux = photons["photon_flux"].mean(1)
+            assert flux.max() < 1.5 * flux.min(), "photons carry about equal power"
+
+
+def test_sparse_pixels(renderer, demo, monkeypatch):
+    """Asked-for pixels only, in the order asked for, with the full image's expectation."""
+    state = away("moving_lights", demo)
+    renderer.scene.set_state(state)
+    camera = sample_view(demo, 16, np.random.default_rng(4))
+    pixels = np.random.default_rng(0).permutation(256)[:40]
+    mean, variance = moments(plain_scene(demo, "moving_lights", state), camera, 1024, 1)
+    mean, variance = (a.reshape(3, -1)[:, pixels] for a in (mean, variance / 1024))
+    ours = samples_of(renderer, camera, 4, range(64), pixels)
+    assert ours.shape[1:] == (3, 40)
+    assert p_value(ours, mean, variance) > ALPHA
+    assert p_value(ours[:, :, ::-1], mean, variance) < 1e-6, "the test cannot tell the pixels apart"
+
+    traced = []
+    launch = renderer_module.launch
+
+    def spy(kernel, lanes, **fixed):
+        traced.append(next(iter(lanes.values()))[1])
+        return launch(kernel, lanes, **fixed)
+
+    monkeypatch.setattr(renderer_module, "launch", spy)
+    renderer.radiance(camera, 2, 0, pixels)
+    corners = np.concatenate(traced)
+    wanted = np.repeat(np.stack([pixels % 16, pixels // 16], 1), 2, axis=0)
+    assert np.array_equal(corners, wanted), "two rays for every pixel asked for, and none else"
+    # In batches, when there are too many to hold at once.
+    monkeypatch.setattr(renderer_module, "_MAX_LANES", 100)
+    traced.clear()
+    batched = samples_of(renderer, camera, 5, range(50), pixels)
+    assert max(map(len, traced)) <= 100 and sum(map(len, traced)) == 50 * 5 * 40
+    assert p_value(batched, mean, variance) > ALPHA
+
+
+def test_one_spp_is_unbiased(renderer, demo):
+    """The mean of many 1-spp images is the high-spp image: nothing is clamped."""
+    state = rest_state(demo, "moving_lights")
+    renderer.scene.set_state(state)
+    camera = sample_view(demo, 12, np.random.default_rng(5))
+    spp = 4096
+    mean, variance = moments(plain_scene(demo, "moving_lights", state), camera, spp, 3)
+    ours = samples_of(renderer, camera, 1, range(500))
+    assert p_value(ours, mean, variance / spp) > ALPHA
+    assert p_value(np.clip(ours, 0, 1), mean, variance / spp) < ALPHA
+
+
+def test_seeds(renderer, demo):
+    renderer.scene.set_state(rest_state(demo, "moving_lights"))
+    camera = sample_view(demo, 12, np.random.default_rng(6))
+    pixels = np.arange(5, 60, 3)
+    for draw in (
+        lambda seed: renderer.radiance(camera, 2, seed),
+        lambda seed: renderer.radiance(camera, 2, seed, pixels),
+        lambda seed: np.concatenate([a.astype(float).ravel() for a in renderer.photons(64, seed).values()]),
+    ):
+        first, other, again = draw(1), draw(2), draw(1)
+        assert first.tobytes() == again.tobytes() and (first != other).mean() > 0.5
+
+
+def test_seeds_are_independent(renderer, demo):
+    """Neighbouring seeds, pixels and samples share no random numbers: residuals are uncorrelated."""
+    renderer.scene.set_state(rest_state(demo, "moving_lights"))
+    camera = sample_view(demo, 12, np.random.default_rng(6))
+    images = samples_of(renderer, camera, 1, range(400)).reshape(400, 3, -1)[:, 1]
+    ranks = stats.rankdata(images, axis=0) - 200.5  # fireflies would rule a plain correlation
+    ranks = ranks[:, ranks.std(0) > 0]
+    scale = ranks.std() ** 2
+    between_seeds = (ranks[1:] * ranks[:-1]).mean() / scale
+    between_pixels = (ranks[:, 1:] * ranks[:, :-1]).mean() / scale
+    assert max(abs(between_seeds), abs(between_pixels)) < 5 / np.sqrt(ranks.size)
+
+
+# ---- G-buffer -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("experiment", ["fixed_lights", "moving_lights"])
+def test_gbuffer(experiment, demo):
+    """Depth, normals and constant albedos against float64 ray-triangle intersections, two states in turn."""
+    renderer = Renderer(Scene(demo, experiment))
+    for k, state in enumerate((rest_state(demo, experiment), away(experiment, demo))):
+        renderer.scene.set_state(state)
+        camera = sample_view(demo, (12, 16)[k], np.random.default_rng(40 + k))
+        meshes = demo_meshes(demo, experiment, state)
+        triangles = np.concatenate([v[shape.mesh.faces] for shape, v in meshes.values()])
+        owner = np.concatenate([[i] * len(shape.mesh.faces) for i, (shape, _) in enumerate(meshes.values())])
+        first = np.searchsorted(owner, np.arange(len(meshes)))
+        pixels = camera.centres()
+        # Pixel (i, j) by hand: K and T, not camera.directions.
+        view = np.linalg.solve(camera.matrix.astype(float), np.append(pixels, np.ones((len(pixels), 1)), 1).T).T
+        rotation = camera.world_to_view[:3, :3].astype(float)
+        z, hit, weights = first_hit(triangles, np.tile(camera.position, (len(pixels), 1)), view @ rotation)
+        buffer = {name: a.reshape(len(a), -1).T for name, a in renderer.gbuffer(camera).items()}
+        light = (buffer["depth"][:, 0] < z - 1e-3) & (np.abs(buffer["albedo"]) < 1e-6).all(1)
+        if experiment == "moving_lights":  # whose rectangle is no mesh
+            z[light] = buffer["depth"][light, 0]
+        same = np.abs(buffer["depth"][:, 0] - z) < 1e-4
+        assert same.mean() > 0.98, "depth along the camera's axis"  # the rest grazes an edge
+        assert np.abs(np.linalg.norm(buffer["normal"], axis=1) - 1).max() < 1e-5
+
+        checked = 0
+        for i, (name, (shape, vertices)) in enumerate(meshes.items()):
+            mine = same & ~light & (owner[hit] == i)
+            if not mine.any():
+                continue
+            face = shape.mesh.faces[hit[mine] - first[i]]
+            if shape.smooth:
+                normal = np.einsum("nk,nkd->nd", weights[mine], shape.mesh.vertex_normals[face])
+            else:
+                a, b, c = (vertices[face[:, j]] for j in range(3))
+                normal = np.cross(b - a, c - a)
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            assert np.abs(buffer["normal"][mine] - normal).max() < 2e-3, name
+            colour = shape.bsdf.get("bsdf", {}).get("reflectance", {})
+            if shape.bsdf["type"] in ("dielectric", "conductor", "roughconductor"):
+                assert (buffer["albedo"][mine] == 0).all()
+            elif colour.get("type") == "rgb":
+                assert np.allclose(buffer["albedo"][mine], colour["value"], atol=1e-5), name
+                checked += 1
+        assert checked > 2
+        assert buffer["albedo"].min() >= 0 and buffer["albedo"].max() <= 1
+        # Depth is not distance: seen obliquely, the two differ.
+        assert (np.linalg.norm(view, axis=1) * z - z).max() > 0.1
+
+
+def test_misses(tmp_path):
+    """Only a floor and a crate: what looks past them is zero, and the crate's depth is known."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    scene = Scene(description, "fixed_lights")
+    renderer = Renderer(scene)
+    scene.set_state(rest_state(description, "fixed_lights"))
+    position = np.array([0.5, 1.0, -0.6])
+    camera = Camera.look_at(position, position + [-0.6, -0.4, 0.6], description.up, 70.0, 16, 16)
+    buffer = renderer.gbuffer(camera)
+    direction = camera.view_directions().astype(float)
+    t = -camera.position[1] / np.where(direction[1] < 0, direction[1], np.nan)
+    floor = camera.position[:, None, None] + t * direction
+    sky = ~((np.abs(floor[0]) < 1) & (np.abs(floor[2]) < 1))
+    on_floor = ~sky & (buffer["normal"][1] > 0.99) & (buffer["depth"][0] > 0)
+    z = (camera.rotation[:, 2] @ (floor - camera.position[:, None, None]).reshape(3, -1)).reshape(sky.shape)
+    assert on_floor.sum() > 20
+    crate = on_floor & (np.abs(buffer["depth"][0] - z) > 1e-3)
+    assert (buffer["depth"][0][crate] < z[crate]).all() and crate.sum() < on_floor.sum() / 2
+    miss = buffer["depth"][0] == 0
+    assert 20 < miss.sum() and (miss <= sky).all(), "what misses looks past the floor"
+    assert all((buffer[name][:, miss] == 0).all() for name in buffer)
+
+
+# ---- photons --------------------------------------------------------------------------------------------
+
+
+def floor_irradiance(patch, size, centre, radiance, height):
+    """Float64 quadrature: mean irradiance of a floor patch (2, 2) from a rectangle that faces down."""
+    mid = lambda low, high, n: low + (np.arange(n) + 0.5) * (high - low) / n
+    grid = lambda low, high: np.stack(np.meshgrid(mid(low[0], high[0], 30), mid(low[1], high[1], 30)), -1).reshape(-1, 2)
+    at, light = grid(*patch), grid(np.array(centre) - np.array(size) / 2, np.array(centre) + np.array(size) / 2)
+    square = ((at[:, None] - light[None]) ** 2).sum(-1) + height**2
+    return (height**2 / square**2).mean() * size[0] * size[1] * np.array(radiance)
+
+
+def test_photons_in_an_open_room(tmp_path):
+    """Power, directions, hits, misses and irradiance on the floor, all known in closed form or by quadrature."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    scene = Scene(description, "fixed_lights")
+    state = SceneState(np.zeros((1, 3), np.float32), np.array([False]))  # without the crate
+    scene.set_state(state)
+    count = 20_000
+    photons = Renderer(scene).photons(count, 1)
+    origin, direction, hit = (photons[f"photon_{n}"].astype(float) for n in ("origin", "direction", "hit"))
+    power = np.pi * LIGHT["size"][0] * LIGHT["size"][1] * np.array(LIGHT["radiance"])
+    assert np.allclose(photons["photon_flux"].sum(0, dtype=float), power, rtol=1e-4)
+    assert np.abs(np.linalg.norm(direction, axis=1) - 1).max() < 1e-5
+    # A Lambertian emitter: the squared cosine is uniform.
+    assert stats.kstest(direction[:, 1] ** 2, stats.uniform.cdf).pvalue > 1e-3 and (direction[:, 1] < 0).all()
+    for axis, size in ((0, LIGHT["size"][0]), (2, LIGHT["size"][1])):
+        assert stats.kstest(origin[:, axis], stats.uniform(-size / 2, size).cdf).pvalue > 1e-3
+
+    expected = origin + direction * (-origin[:, 1] / direction[:, 1])[:, None]
+    lands = (np.abs(expected[:, [0, 2]]) < 1).all(1)
+    assert (photons["photon_valid"] == lands).mean() > 0.9999 and 0.1 < lands.mean() < 0.9
+    both = lands & photons["photon_valid"]
+    assert np.abs(hit[both] - expected[both]).max() < 1e-3
+    assert (hit[~photons["photon_valid"]] == 0).all()
+
+    patch = np.array([[-0.3, 0.1], [0.5, 0.8]])
+    inside = both & (hit[:, [0, 2]] > patch[0]).all(1) & (hit[:, [0, 2]] < patch[1]).all(1)
+    irradiance = floor_irradiance(patch, LIGHT["size"], (0, 0), LIGHT["radiance"], LIGHT["height"])
+    share = irradiance * np.prod(patch[1] - patch[0]) / power  # of the photons that fall into the patch
+    assert np.ptp(share) < 1e-9
+    assert stats.binomtest(int(inside.sum()), count, share[0]).pvalue > 1e-3
+
+
+def test_photons_of_two_emitters(demo):
+    """In proportion to power; first hits as by float64 ray-triangle intersection."""
+    scene = Scene(demo, "fixed_lights")
+    state = sample_state(demo, "fixed_lights", np.random.default_rng(2))
+    scene.set_state(state)
+    photons = Renderer(scene).photons(3000, 4)
+    window = np.pi * 1.5 * 1.2 * np.array([3.8, 4.5, 5.5])
+    lamp = np.pi * np.array([5.8, 5.0, 4.1])
+    assert np.allclose(photons["photon_flux"].sum(0, dtype=float), window + lamp, rtol=3e-3)
+    from_lamp = photons["photon_origin"][:, 1] > 2.5  # under the ceiling, above the window
+    share = lamp.mean() / (window + lamp).mean()
+    assert abs(from_lamp.sum() - 3000 * share) < 3, "systematic: not even binomial noise"
+    colours = photons["photon_flux"] / photons["photon_flux"].sum(1, keepdims=True)
+    assert np.allclose(colours[from_lamp], lamp / lamp.sum(), atol=1e-5)
+    assert np.allclose(colours[~from_lamp], window / window.sum(), atol=1e-5)
+
+    some = np.random.default_rng(0).permutation(3000)[:150]
+    meshes = demo_meshes(demo, "fixed_lights", state)
+    triangles = np.concatenate([v[shape.mesh.faces] for shape, v in meshes.values()])
+    origin, direction = (photons[f"photon_{n}"][some].astype(float) for n in ("origin", "direction"))
+    t, _, _ = first_hit(triangles, origin, direction)
+    off = np.linalg.norm(origin + t[:, None] * direction - photons["photon_hit"][some], axis=1)
+    assert (off < 1e-3).mean() > 0.98 and photons["photon_valid"].all(), "the room is closed"
+
+
+def test_photons_of_the_moved_light(renderer, demo):
+    state = rest_state(demo, "moving_lights")
+    state.translation[-1] = [1.1, 0, -0.7]
+    renderer.scene.set_state(state)
+    photons = renderer.photons(2000, 0)
+    centre, half = demo.light.box.mean(0) + [1.1, 0, -0.7], demo.light.size / 2
+    off = photons["photon_origin"] - centre
+    assert stats.kstest(off[:, 0], stats.uniform(-half[0], 2 * half[0]).cdf).pvalue > 1e-3
+    assert stats.kstest(off[:, 2], stats.uniform(-half[1], 2 * half[1]).cdf).pvalue > 1e-3
+    assert np.abs(off[:, 1]).max() < 1e-3 and (photons["photon_direction"][:, 1] < 0).all()
+    power = np.pi * demo.light.size.prod() * demo.light.radiance
+    assert np.allclose(photons["photon_flux"].sum(0, dtype=float), power, rtol=1e-4)
+    assert demo.movables("moving_lights")[-1].name == MOVING_LIGHT
+
+
+# ---- the lemma ------------------------------------------------------------------------------------------
+
+
+def gradients(network, inputs, targets):
+    """(n, parameters): of the mean squared error against each target."""
+
+    def loss(parameters, target):
+        return ((torch.func.functional_call(network, parameters, inputs) - target) ** 2).mean()
+
+    each = torch.func.vmap(torch.func.grad(loss), (None, 0))(dict(network.named_parameters()), targets)
+    return torch.cat([g.flatten(1) for g in each.values()], 1).detach().numpy()
+
+
+def test_lemma(renderer, demo):
+    """Eq. 2: noisy targets give the gradient of the noise-free image in expectation; clamped ones do not."""
+    renderer.scene.set_state(away("moving_lights", demo))
+    camera = sample_view(demo, 16, np.random.default_rng(9))
+    inputs = torch.from_numpy(np.concatenate(list(renderer.gbuffer(camera).values()))[None].astype(float))
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(
+        torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, 3, 1)
+    ).double()
+    images = lambda spp, seeds: torch.from_numpy(
+        np.stack([renderer.radiance(camera, spp, seed) for seed in seeds])[:, None].astype(float)
+    )
+    noisy = images(1, range(500))
+    exact = gradients(network, inputs, images(64, range(1000, 1040)))
+
+    def worst(targets):
+        p = stats.ttest_ind(gradients(network, inputs, targets), exact, equal_var=False).pvalue
+        return p.min() * len(p)
+
+    assert worst(noisy) > 1e-3
+    assert worst(noisy.clamp(0, 1)) < 1e-9
+
+
+# ---- the variant ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def probing(monkeypatch):
+    """choose_variant as in a fresh process; returns what was probed. Set `works` to decide the outcome."""
+    monkeypatch.delenv("NLT_VARIANT", raising=False)
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    probed = []
+    monkeypatch.setattr(variant_module, "_llvm_libraries", lambda: ["/new.so", "/old.so"])
+    monkeypatch.setattr(variant_module, "_works", lambda *pair: probed.append(pair) or probing_works(*pair))
+    probing_works = lambda variant, library: (variant, library) in probed_ok
+    probed_ok: set = set()
+    yield probed, probed_ok
+    # choose_variant records its choice there for worker processes.
+    for name in ("NLT_VARIANT", "DRJIT_LIBLLVM_PATH"):
+        os.environ.pop(name, None)
+
+
+def test_variant_order(probing):
+    probed, ok = probing
+    choose = variant_module.choose_variant.__wrapped__
+    order = [("cuda_ad_rgb", None), ("llvm_ad_rgb", "/new.so"), ("llvm_ad_rgb", "/old.so")]
+    fallback = choose()
+    assert probed == order and fallback.name == "scalar_rgb"
+    assert "cuda_ad_rgb" in fallback.reason and "llvm_ad_rgb" in fallback.reason
+
+    probed.clear()
+    ok.add(order[2])
+    chosen = choose()
+    assert probed == order and chosen.name == "llvm_ad_rgb" and "/old.so" in chosen.reason
+    assert os.environ["NLT_VARIANT"] == "llvm_ad_rgb" and os.environ["DRJIT_LIBLLVM_PATH"] == "/old.so"
+
+    del os.environ["NLT_VARIANT"]
+    probed.clear()
+    ok.add(order[0])
+    assert choose().name == "cuda_ad_rgb" and probed == order[:1]
+
+
+def test_variant_set_by_hand(probing, monkeypatch):
+    monkeypatch.setenv("NLT_VARIANT", "scalar_rgb")
+    chosen = variant_module.choose_variant.__wrapped__()
+    assert chosen.name == "scalar_rgb" and "NLT_VARIANT" in chosen.reason and not probing[0]
+
+
+def test_variant_unknown(probing, monkeypatch):
+    monkeypatch.setenv("NLT_VARIANT", "palace_rgb")
+    with pytest.raises(UserError, match="NLT_VARIANT.*scalar_rgb.*palace_rgb"):
+        variant_module.choose_variant.__wrapped__()
+
+
+def test_probe():
+    """The real probe: what runs here passes it, and a broken LLVM only kills the probe."""
+    assert not is_jit() or variant_module._works(mi.variant(), None)
+    assert not variant_module._works("llvm_ad_rgb", "/dev/null")
+
+
+def test_scalar_agrees(renderer, demo):
+    """The scalar variant, in a process of its own, has the same expectation as the one that runs here."""
+    code = (
+        "import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()\n"
+        "from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene\n"
+        "from nlt.scenes.description import load_description; from nlt.scenes.state import rest_state, sample_view\n"
+        "d = load_description('demo_room'); r = Renderer(Scene(d, 'moving_lights'))\n"
+        "r.scene.set_state(rest_state(d, 'moving_lights')); c = sample_view(d, 12, np.random.default_rng(7))\n"
+        "np.save(sys.stdout.buffer, np.stack([r.radiance(c, 8, s) for s in range(40)]))\n"
+    )
+    environment = dict(os.environ, NLT_VARIANT="scalar_rgb")
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
+    scalar = np.einsum("xc,nchw->nxhw", XYZ, np.frombuffer(done.stdout[-40 * 3 * 144 * 4 :], np.float32).reshape(40, 3, 12, 12))
+    renderer.scene.set_state(rest_state(demo, "moving_lights"))
+    ours = samples_of(renderer, sample_view(demo, 12, np.random.default_rng(7)), 8, range(50, 90))
+    assert p_value(ours, scalar.mean(0), scalar.var(0, ddof=1) / 40) > ALPHA
+    assert is_jit() == dr.is_jit_v(mi.Float)
