@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from nlt import __version__
 from nlt.errors import UserError
@@ -25,9 +26,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"nlt: error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # no space, no permission: what is written stays
+        place = error.filename or "nlt"
+        print(f"nlt: error: {place}: {error.strerror or error}; set it right and run again", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("nlt: interrupted; run the same command again to go on", file=sys.stderr)
         return 130
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line for a mistake here as everywhere."""
+        raise UserError(f"{message}; see {self.prog} --help")
 
 
 def _run(arguments: list[str]) -> int:
@@ -42,6 +53,10 @@ def _run(arguments: list[str]) -> int:
         from nlt.data.spec import load_spec
 
         print(generate(*load_spec(options.config), workers=options.workers))
+    elif options.command == "show":
+        from nlt.evaluation.show import show_sample
+
+        print(show_sample(options.dataset, options.split, options.index, options.output))
     elif options.command == "compare":
         from nlt.evaluation.compare import compare
 
@@ -50,12 +65,17 @@ def _run(arguments: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="nlt", description="Learned light transport: data, training, comparison.")
+    parser = _Parser(prog="nlt", description="Learned light transport: data, training, comparison.")
     parser.add_argument("--version", action="version", version=f"nlt {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     generate = commands.add_parser("generate", help="render a dataset; resumes, and does nothing if it is complete")
     generate.add_argument("--config", action="append", required=True, help="YAML; later ones override earlier ones")
     generate.add_argument("--workers", type=_positive, help="rendering processes (default: one per core)")
+    show = commands.add_parser("show", help="draw the components of a sample")
+    show.add_argument("dataset", help="directory of a dataset, as `nlt generate` prints it")
+    show.add_argument("--split", choices=("val", "test"), default="test")
+    show.add_argument("--index", type=int, default=0)
+    show.add_argument("-o", "--output", default="sample.png")
     for name, text in _LIGHTNING.items():
         # Handed to Lightning's own parser before this one sees it; here for the help.
         commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")

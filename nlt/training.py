@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
+import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 from jsonargparse import ArgumentError
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from PIL import Image
 
 from nlt.data.datamodule import LightTransportDataModule
+from nlt.data.spec import read_configs
 from nlt.errors import UserError
+from nlt.metrics.display import display
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 
 # Advice for other set-ups than ours; what it says is either decided on purpose or untrue here.
-_NOISE = (".*does not have many workers.*", ".*LeafSpec.*", ".*log_every_n_steps.*", ".*GPU available but not used.*")
+_NOISE = (
+    ".*does not have many workers.*",
+    ".*LeafSpec.*",
+    ".*log_every_n_steps.*",
+    ".*GPU available but not used.*",
+    ".*LightningCLI's args parameter.*",
+    ".*The dirpath has changed.*",
+)
+# Checkpoints that Lightning finds by itself.
+_LIGHTNINGS_OWN = ("best", "last", "hpc")
 
 
 class Checkpoints(ModelCheckpoint):
@@ -26,6 +43,28 @@ class Checkpoints(ModelCheckpoint):
 
     def __init__(self) -> None:
         super().__init__(filename="{epoch}-{step}", save_top_k=1, save_on_train_epoch_end=True)
+
+
+class Predictions(BasePredictionWriter):
+    """`nlt predict`: every predicted image as displayed, in the run's directory predictions/, by sample index."""
+
+    def __init__(self) -> None:
+        super().__init__(write_interval="batch")
+
+    def on_predict_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self.directory = Path(trainer.log_dir or trainer.default_root_dir) / "predictions"
+        self.directory.mkdir(parents=True, exist_ok=True)
+
+    def write_on_batch_end(
+        self, trainer: Any, pl_module: Any, prediction: Any, indices: Any, batch: Any, *_: Any
+    ) -> None:
+        images = (255 * display(prediction, batch["exposure"])).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+        for index, image in zip(batch["index"].tolist(), images, strict=True):
+            Image.fromarray(image).save(self.directory / f"{index:07d}.png")
+
+    def on_predict_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.is_global_zero:
+            print(self.directory)
 
 
 class NLTCLI(LightningCLI):
@@ -37,6 +76,24 @@ class NLTCLI(LightningCLI):
 
     def _parse_ckpt_path(self) -> None:
         """Not Lightning's: that would silently replace the config's model by the checkpoint's."""
+        command = self.config.subcommand
+        path = self.config[command].get("ckpt_path")
+        if path is None and command != "fit":
+            raise UserError(f"--ckpt_path: missing; nlt {command} needs a checkpoint of nlt fit")
+        if path and path not in _LIGHTNINGS_OWN:
+            try:
+                read_checkpoint(path)
+            except OSError as error:
+                raise UserError(f"--ckpt_path: {path}: cannot be read: {error.strerror}") from None
+            except Exception:  # whatever a damaged file makes the unpickler raise
+                raise UserError(f"--ckpt_path: {path}: not a checkpoint, or damaged; give another one") from None
+
+    def instantiate_classes(self) -> None:
+        """Lightning's, refusals of a model or the trainer said as a user's mistake."""
+        try:
+            super().instantiate_classes()
+        except (ValueError, MisconfigurationException) as error:
+            raise UserError(_one_line(str(error))) from None
 
 
 def run_lightning(arguments: list[str]) -> NLTCLI:
@@ -45,10 +102,12 @@ def run_lightning(arguments: list[str]) -> NLTCLI:
     Raises:
         UserError: a config, a checkpoint or the dataset is wrong.
     """
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     for pattern in _NOISE:
         warnings.filterwarnings("ignore", pattern)
     torch.set_float32_matmul_precision("high")
+    given = _check_configs(arguments)
     try:
         return NLTCLI(
             RenderingModule,
@@ -62,9 +121,44 @@ def run_lightning(arguments: list[str]) -> NLTCLI:
             args=arguments,
         )
     except ArgumentError as error:
-        raise UserError(" ".join(str(error).split())) from None
-    except FileNotFoundError as error:
-        raise UserError(f"{error.filename or error}: no such file") from None
+        raise UserError(_with_place(str(error), given, arguments[0])) from None
+    except UserError as error:  # one from a loader process comes with that process's traceback
+        raise UserError(str(error).rpartition("UserError: ")[2].strip()) from None
+
+
+def _check_configs(arguments: list[str]) -> dict[str, str]:
+    """What settings come from: --config files, once they can be read, and other arguments, with their text.
+
+    Raises:
+        UserError: a file cannot be read, or settings of a model come before the model.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-c", "--config", action="append", nargs="?", default=[])
+    options, rest = parser.parse_known_args(arguments[1:])
+    files = [file for file in options.config if file]
+    known = any(argument.startswith("--model") for argument in rest)
+    for file in files:
+        model = read_configs([file]).get("model")
+        known = known or (isinstance(model, Mapping) and "class_path" in model)
+        if model and not known:
+            raise UserError(f"{file}: model.class_path: missing; give a --config of configs/model before this one")
+    return {file: Path(file).read_text() for file in files} | {argument: argument for argument in rest}
+
+
+def _one_line(message: str) -> str:
+    """jsonargparse's or Lightning's message, without the alternatives that were not meant."""
+    message = " ".join(message.split())
+    return re.sub(r"Does not validate .*? Errors: - (.*?) - Expected a <class 'NoneType'>.*", r"\1", message)
+
+
+def _with_place(message: str, given: dict[str, str], command: str) -> str:
+    """jsonargparse's message as one line, headed by the files or arguments it is about."""
+    message = _one_line(message)
+    keys = re.findall(r"""(?:[Oo]ption|Parser key) ['"]([\w.]+)['"]""", message)
+    words = keys[-1].split(".") if keys else []
+    about = [name for name, text in given.items() if all(re.search(rf"\b{word}\b", text) for word in words)]
+    place = " + ".join(about or given) or f"nlt {command}"
+    return f"{place}: {message}; see nlt {command} --help"
 
 
 def trainer_defaults() -> dict[str, Any]:
@@ -73,15 +167,21 @@ def trainer_defaults() -> dict[str, Any]:
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
         "default_root_dir": "runs",
-        "callbacks": [LearningRateMonitor(logging_interval="epoch"), Checkpoints(), ImageGrid()],
+        "callbacks": [LearningRateMonitor(logging_interval="epoch"), Checkpoints(), ImageGrid(), Predictions()],
     }
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint, without running any code that it may hold. A file that is none raises anything."""
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    return dict(checkpoint)
 
 
 def newest_checkpoint(run: Path) -> Path | None:
     """The latest checkpoint of a run that can be read: one that was being written at a kill -9 is passed over."""
     for path in sorted(run.glob("checkpoints/*.ckpt"), key=lambda p: p.stat().st_mtime, reverse=True):
         try:
-            torch.load(path, map_location="cpu", weights_only=True)
+            read_checkpoint(path)
         except Exception:  # whatever a truncated file makes the unpickler raise
             continue
         return path

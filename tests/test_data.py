@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from conftest import first_hit, demo_meshes, write_yaml
+from conftest import demo_meshes, first_hit, write_yaml
 
 from nlt.data import generate as generation
 from nlt.data import store
@@ -25,13 +25,16 @@ from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 from nlt.models.projection import visible_pixels
-from nlt.paths import CONFIGS, PROJECT, scenes_root
+from nlt.paths import PROJECT, scenes_root
 from nlt.scenes.assembly import Scene
 from nlt.scenes.description import load_description
 from nlt.scenes.pointcloud import sample_points
-from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
+from nlt.scenes.state import rest_state, sample_state, sample_view
 
-SIZE = dict(resolution=16, train=12, val=4, test=4, points=200, photons=200, reference_spp=2, shard_size=4)
+SIZE = {
+    "resolution": 16, "train": 12, "val": 4, "test": 4, "points": 200, "photons": 200, "reference_spp": 2,
+    "shard_size": 4,
+}  # fmt: skip
 
 
 def spec_of(*scenes, **more):
@@ -77,7 +80,7 @@ def test_fields(dataset):
         assert points[name].shape == field.resolve(spec.sizes) and points[name].dtype == field.dtype, name
 
 
-def test_samples_differ_and_mean_what_they_say(dataset):
+def test_samples_differ_and_mean_what_they_say(dataset, demo):
     samples = samples_of(dataset, "test") + samples_of(dataset, "train")
     for name in ("noisy", "noisy_input", "depth", "world_to_view", "photon_origin", "translation"):
         values = [s[name].numpy().tobytes() for s in samples]
@@ -86,7 +89,7 @@ def test_samples_differ_and_mean_what_they_say(dataset):
         assert not torch.equal(s["noisy"], s["noisy_input"])
         assert (s["translation"][~s["present"]] == 0).all() and (s["photon_hit"][~s["photon_valid"]] == 0).all()
         # The closed room's photons all carry the light's power.
-        power = torch.tensor([18.0, 16.8, 15.0]) * torch.pi
+        power = torch.from_numpy(demo.light.radiance * demo.light.size.prod() * np.pi).float()
         assert torch.allclose(s["photon_flux"].sum(0), power, rtol=1e-3)
     for s in samples[:4]:
         assert not torch.equal(s["reference_a"], s["reference_b"])
@@ -182,11 +185,11 @@ _worker = generation._worker
 def _killed_once(spec, directory, job, *rest):
     """A worker that is killed after its first shard, once."""
     marker = directory.parent / "killed"
-    if marker.exists():
-        return _worker(spec, directory, job, *rest)
-    marker.touch()
-    _worker(spec, directory, (job[0], job[1][:1], False), *rest)
-    os.kill(os.getpid(), signal.SIGKILL)
+    if not marker.exists():
+        marker.touch()
+        _worker(spec, directory, (job[0], job[1][:1], False), *rest)
+        os.kill(os.getpid(), signal.SIGKILL)
+    _worker(spec, directory, job, *rest)
 
 
 def _always_killed(*_):
@@ -195,6 +198,7 @@ def _always_killed(*_):
 
 def test_killed_worker(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_worker", _killed_once)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
     assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
     assert (tmp_path / "killed").exists()
 
@@ -322,9 +326,12 @@ def test_points_and_directions_of_a_batch(dataset, demo):
 def test_reads_only_what_is_asked_for(dataset, monkeypatch):
     asked = []
     read = store.ShardReader.read
-    monkeypatch.setattr(
-        store.ShardReader, "read", lambda self, path, row, fields: asked.append(set(fields)) or read(self, path, row, fields)
-    )
+
+    def spy(self, path, row, fields):
+        asked.append(set(fields))
+        return read(self, path, row, fields)
+
+    monkeypatch.setattr(store.ShardReader, "read", spy)
     spec = spec_of()
     for inputs, split, expected, given in (
         ({"depth"}, "train", {"depth", "noisy"}, {"depth", "noisy"}),
@@ -333,7 +340,7 @@ def test_reads_only_what_is_asked_for(dataset, monkeypatch):
         ({"point_position"}, "train", {"noisy", "translation", "present"}, None),
     ):
         chosen = LightTransportDataset(dataset, spec, split, inputs)
-        asked.clear()
+        asked.clear()  # of the points
         sample = chosen[0]
         assert asked == [expected] and set(inputs) <= set(sample)
         if given:
@@ -382,7 +389,7 @@ def test_two_scenes(tmp_path):
     one = write_yaml(tmp_path / "one.yaml", name="one", exposure=2.0)
     objects = {"rug": {"shapes": ["rug"], "box": [[-0.1, 0, 0], [0.1, 0, 0]]}}
     two = write_yaml(tmp_path / "two.yaml", name="two", exposure=0.5, objects=objects)
-    more = dict(experiment="fixed_lights", train=2, val=1, test=1, shard_size=2)
+    more = {"experiment": "fixed_lights", "train": 2, "val": 1, "test": 1, "shard_size": 2}
     spec = spec_of(str(one), str(two), **more)
     generate(spec, tmp_path, workers=1)
     module = LightTransportDataModule(spec, str(tmp_path), batch_size=4, workers=0)
@@ -442,7 +449,7 @@ def by_triangles(triangles, origin, points):
     return t > 1 - 1e-4
 
 
-@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.8, 0.2), (128, 0.8, 0.2)])
+@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.82, 0.06), (128, 0.89, 0.04)])
 def test_projection_sees_what_the_camera_sees(demo, resolution, least, most):
     def free(state, origin, points):
         meshes = demo_meshes(demo, "fixed_lights", state)
@@ -450,15 +457,12 @@ def test_projection_sees_what_the_camera_sees(demo, resolution, least, most):
 
     state_of = lambda k: sample_state(demo, "fixed_lights", np.random.default_rng([k, 4]))
     result = shares(demo, "fixed_lights", resolution, 3, free, state_of)
-    print(resolution, result)
     assert result["seen"] > 300 and result["hidden"] > 300
     assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]
 
 
-@pytest.mark.skipif(
-    not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}"
-)
-@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.8, 0.2), (128, 0.8, 0.2)])
+@pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}")
+@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.79, 0.12), (128, 0.86, 0.085)])
 def test_projection_in_the_living_room(resolution, least, most):
     description = load_description("living-room")
     plain = mi.load_file(str(description.path), optimize=False)
@@ -475,6 +479,5 @@ def test_projection_in_the_living_room(resolution, least, most):
         return ~np.array([plain.ray_test(ray) for ray in rays])
 
     result = shares(description, "fixed_lights", resolution, 3, free, lambda k: rest_state(description, "fixed_lights"))
-    print(resolution, result)
     assert result["seen"] > 300 and result["hidden"] > 300
     assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]

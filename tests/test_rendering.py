@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def moments(plain, camera, spp, seed):
     integrator = mi.load_dict({"type": "moment", "path": {"type": "path", "max_depth": -1}})
     image = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=spp, seed=seed)), 2, 0)
     mean, square = image[3:6].astype(float), image[6:9].astype(float)
-    return mean, (square - mean**2) * spp / (spp - 1)
+    return mean, np.maximum(square - mean**2, 0) * spp / (spp - 1)
 
 
 def samples_of(renderer, camera, spp, seeds, pixels=None):
@@ -138,13 +137,13 @@ def test_emitter_that_moves(tmp_path, movable):
     references = []
     # Removed first: what is learnt of the emitters' power then must not be kept. Often, for moved meshes whose
     # memory Dr.Jit does not own were read after it was freed, every now and then.
-    for k, (offset, present) in enumerate([((0, 0, 0), False), ((-0.2, -0.3, 0.2), True)] * 4):
+    for k, (offset, present) in enumerate([((0, 0, 0), False), ((-0.2, -0.3, 0.2), True)] * 3):
         state = SceneState(np.array([offset], np.float32), np.array([present]))
         renderer.scene.set_state(state)
         if k < 2:
             mean, variance = moments(plain_scene(description, "fixed_lights", state), camera, 512, k)
             references.append((mean, variance / 512))
-        assert p_value(samples_of(renderer, camera, 4, range(60)), *references[k % 2]) > ALPHA
+        assert p_value(samples_of(renderer, camera, 4, range(40)), *references[k % 2]) > ALPHA
         photons = renderer.photons(1000, k)
         lit = [v for name, v in areas.items() if present or name not in shapes]
         power = sum(np.pi * area * np.array(radiance) for area, radiance in lit)
@@ -196,7 +195,7 @@ def test_one_spp_is_unbiased(renderer, demo):
     mean, variance = moments(plain_scene(demo, "moving_lights", state), camera, spp, 3)
     ours = samples_of(renderer, camera, 1, range(500))
     assert p_value(ours, mean, variance / spp) > ALPHA
-    assert p_value(np.clip(ours, 0, 1), mean, variance / spp) < ALPHA
+    assert p_value(np.minimum(ours, 2 * mean), mean, variance / spp) < 1e-6, "the test cannot tell clamped images"
 
 
 def test_seeds(renderer, demo):
@@ -284,7 +283,7 @@ def test_misses(tmp_path):
     renderer = Renderer(scene)
     scene.set_state(rest_state(description, "fixed_lights"))
     position = np.array([0.5, 1.0, -0.6])
-    camera = Camera.look_at(position, position + [-0.6, -0.4, 0.6], description.up, 70.0, 16, 16)
+    camera = Camera.look_at(position, position + np.array([-0.6, -0.4, 0.6]), description.up, 70.0, 16, 16)
     buffer = renderer.gbuffer(camera)
     direction = camera.view_directions().astype(float)
     t = -camera.position[1] / np.where(direction[1] < 0, direction[1], np.nan)
@@ -296,7 +295,7 @@ def test_misses(tmp_path):
     crate = on_floor & (np.abs(buffer["depth"][0] - z) > 1e-3)
     assert (buffer["depth"][0][crate] < z[crate]).all() and crate.sum() < on_floor.sum() / 2
     miss = buffer["depth"][0] == 0
-    assert 20 < miss.sum() and (miss <= sky).all(), "what misses looks past the floor"
+    assert miss.sum() > 20 and (miss <= sky).all(), "what misses looks past the floor"
     assert all((buffer[name][:, miss] == 0).all() for name in buffer)
 
 
@@ -306,7 +305,8 @@ def test_misses(tmp_path):
 def floor_irradiance(patch, size, centre, radiance, height):
     """Float64 quadrature: mean irradiance of a floor patch (2, 2) from a rectangle that faces down."""
     mid = lambda low, high, n: low + (np.arange(n) + 0.5) * (high - low) / n
-    grid = lambda low, high: np.stack(np.meshgrid(mid(low[0], high[0], 30), mid(low[1], high[1], 30)), -1).reshape(-1, 2)
+    axes = lambda low, high: [mid(low[k], high[k], 30) for k in (0, 1)]
+    grid = lambda low, high: np.stack(np.meshgrid(*axes(low, high)), -1).reshape(-1, 2)
     at, light = grid(*patch), grid(np.array(centre) - np.array(size) / 2, np.array(centre) + np.array(size) / 2)
     square = ((at[:, None] - light[None]) ** 2).sum(-1) + height**2
     return (height**2 / square**2).mean() * size[0] * size[1] * np.array(radiance)
@@ -371,10 +371,10 @@ def test_photons_of_two_emitters(demo):
 
 def test_photons_of_the_moved_light(renderer, demo):
     state = rest_state(demo, "moving_lights")
-    state.translation[-1] = [1.1, 0, -0.7]
+    state.translation[-1] = [0.9, 0, -0.7]
     renderer.scene.set_state(state)
     photons = renderer.photons(2000, 0)
-    centre, half = demo.light.box.mean(0) + [1.1, 0, -0.7], demo.light.size / 2
+    centre, half = demo.light.box.mean(0) + state.translation[-1], demo.light.size / 2
     off = photons["photon_origin"] - centre
     assert stats.kstest(off[:, 0], stats.uniform(-half[0], 2 * half[0]).cdf).pvalue > 1e-3
     assert stats.kstest(off[:, 2], stats.uniform(-half[1], 2 * half[1]).cdf).pvalue > 1e-3
@@ -403,9 +403,7 @@ def test_lemma(renderer, demo):
     camera = sample_view(demo, 16, np.random.default_rng(9))
     inputs = torch.from_numpy(np.concatenate(list(renderer.gbuffer(camera).values()))[None].astype(float))
     torch.manual_seed(0)
-    network = torch.nn.Sequential(
-        torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, 3, 1)
-    ).double()
+    network = torch.nn.Sequential(torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, 3, 1)).double()
     images = lambda spp, seeds: torch.from_numpy(
         np.stack([renderer.radiance(camera, spp, seed) for seed in seeds])[:, None].astype(float)
     )
@@ -425,16 +423,15 @@ def test_lemma(renderer, demo):
 
 @pytest.fixture
 def probing(monkeypatch):
-    """choose_variant as in a fresh process; returns what was probed. Set `works` to decide the outcome."""
+    """choose_variant as in a fresh process; returns (what was probed, what works)."""
     monkeypatch.delenv("NLT_VARIANT", raising=False)
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     probed = []
     monkeypatch.setattr(variant_module, "_llvm_libraries", lambda: ["/new.so", "/old.so"])
-    monkeypatch.setattr(variant_module, "_works", lambda *pair: probed.append(pair) or probing_works(*pair))
-    probing_works = lambda variant, library: (variant, library) in probed_ok
-    probed_ok: set = set()
-    yield probed, probed_ok
-    # choose_variant records its choice there for worker processes.
+    ok: set = set()
+    monkeypatch.setattr(variant_module, "_works", lambda *pair: probed.append(pair) or pair in ok)
+    yield probed, ok
+    # choose_variant records its choice there, and monkeypatch restores only what was there before.
     for name in ("NLT_VARIANT", "DRJIT_LIBLLVM_PATH"):
         os.environ.pop(name, None)
 
@@ -467,7 +464,7 @@ def test_variant_set_by_hand(probing, monkeypatch):
 
 def test_variant_unknown(probing, monkeypatch):
     monkeypatch.setenv("NLT_VARIANT", "palace_rgb")
-    with pytest.raises(UserError, match="NLT_VARIANT.*scalar_rgb.*palace_rgb"):
+    with pytest.raises(UserError, match=r"NLT_VARIANT.*scalar_rgb.*palace_rgb"):
         variant_module.choose_variant.__wrapped__()
 
 
@@ -489,8 +486,8 @@ def test_scalar_agrees(renderer, demo):
     )
     environment = dict(os.environ, NLT_VARIANT="scalar_rgb")
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
-    scalar = np.einsum("xc,nchw->nxhw", XYZ, np.frombuffer(done.stdout[-40 * 3 * 144 * 4 :], np.float32).reshape(40, 3, 12, 12))
+    images = np.frombuffer(done.stdout[-40 * 3 * 144 * 4 :], np.float32).reshape(40, 3, 12, 12)
+    scalar = np.einsum("xc,nchw->nxhw", XYZ, images)
     renderer.scene.set_state(rest_state(demo, "moving_lights"))
     ours = samples_of(renderer, sample_view(demo, 12, np.random.default_rng(7)), 8, range(50, 90))
     assert p_value(ours, scalar.mean(0), scalar.var(0, ddof=1) / 40) > ALPHA
-    assert is_jit() == dr.is_jit_v(mi.Float)

@@ -150,7 +150,8 @@ def test_static_has_nothing_to_move(demo):
 def test_views_follow_the_supplementary(demo):
     rng = np.random.default_rng(6)
     views = [sample_view(demo, 16, rng) for _ in range(600)]
-    low, high = np.array([[-1.8, 1.0, -1.7], [2.2, 1.6, 1.75]])
+    box = yaml.safe_load((CONFIGS / "scenes" / "demo_room.yaml").read_text())["camera"]
+    low, high = np.array(box["min"]), np.array(box["max"])
     position = np.stack([v.position for v in views])
     p = [stats.kstest(position[:, k], stats.uniform(low[k], high[k] - low[k]).cdf).pvalue for k in range(3)]
     assert min(p) > 1e-3
@@ -239,4 +240,3 @@ def test_moving_light_is_as_wide_along_x_as_it_says(tmp_path):
     on_light = points["position"][points["emission"].any(1)]
     assert np.allclose(on_light.min(0), [-0.05, 1.8, -0.5], atol=0.05)
     assert np.allclose(on_light.max(0), [0.25, 1.8, 0.3], atol=0.05)
-

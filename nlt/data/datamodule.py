@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from nlt.data.sample import BATCH_FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import ShardReader, check_dataset, points_path, read_points
 from nlt.errors import UserError
@@ -39,7 +40,7 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         needed = set(stored) if self._wanted is None else self._wanted & set(stored)
         if self._wants("view_direction"):
             needed |= {"camera_matrix", "world_to_view"}
-        if self._wants("point_position") or self._wants("point_visible"):
+        if any(self._wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
             needed |= {"translation", "present"}
         self._stored = [name for name in stored if name in needed]
 

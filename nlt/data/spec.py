@@ -20,6 +20,9 @@ from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, lo
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 1  # of the files on disk
+# Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
+SECTIONS = ("data", "model", "trainer", "seed_everything")
+DATA = ("dataset", "root", "batch_size", "workers", "seed")
 _DRAWS = 1000  # of a state that no other split has
 
 
@@ -143,7 +146,7 @@ class DatasetSpec:
                         break
                     state = sample_state(description, self.experiment, rng)
                 else:
-                    raise UserError(f"{description.file}: objects: too few different states for three splits; widen a box")
+                    raise UserError(f"{description.file}: objects: too few states for three splits; widen a box")
                 states[split].append(state)
         return states
 
@@ -197,10 +200,12 @@ def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
     data = read_configs(files).get("data")
     if not isinstance(data, Mapping) or not isinstance(data.get("dataset"), Mapping):
         raise UserError(f"{where}: data.dataset: missing; add a config of configs/data")
-    known = [field.name for field in dataclasses.fields(DatasetSpec)]
-    for key in data["dataset"]:
-        if key not in known:
-            raise UserError(f"{where}: data.dataset.{key}: unknown key; known are {', '.join(known)}")
+    dataset = tuple(field.name for field in dataclasses.fields(DatasetSpec))
+    sections = (("", read_configs(files), SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
+    for section, content, known in sections:
+        for key in content:
+            if key not in known:
+                raise UserError(f"{where}: {section}{key}: unknown key; known are {', '.join(known)}")
     if "scenes" not in data["dataset"]:
         raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
     return DatasetSpec(**data["dataset"]), Path(data.get("root", "datasets"))

@@ -71,6 +71,9 @@ class RenderingModule(L.LightningModule):
             seed: of what a method draws at random in training.
         """
         super().__init__()
+        for name, value, least in (("width", width, 1), ("depth", depth, 0)):
+            if value < least:
+                raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
         self.save_hyperparameters()
         self.loss = getattr(losses, loss)
         # channels_last: the convolutions' fastest layout
@@ -189,14 +192,15 @@ class RenderingModule(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raises UserError if the checkpoint is of another method or another size."""
+        path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
-            raise _wrong_method(checkpoint, type(self))
+            raise _wrong_method(path, checkpoint, type(self))
         saved = checkpoint["architecture"]
         different = [name for name in self.architecture if saved[name] != self.hparams[name]]
         if different:
             raise UserError(
-                f"checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, this model "
-                f"{', '.join(f'{name}={self.hparams[name]}' for name in different)}: "
+                f"{path or 'given'}: checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, "
+                f"this model {', '.join(f'{name}={self.hparams[name]}' for name in different)}: "
                 "use the configuration the checkpoint was trained with"
             )
 
@@ -216,13 +220,13 @@ class RenderingModule(L.LightningModule):
         except (ImportError, AttributeError, ValueError):
             method = None
         if not (isinstance(method, type) and issubclass(method, cls)):
-            raise _wrong_method(checkpoint, cls)
+            raise _wrong_method(checkpoint_path, checkpoint, cls)
         return super(RenderingModule, method).load_from_checkpoint(checkpoint_path, *args, **kwargs)
 
 
-def _wrong_method(checkpoint: dict[str, Any], wanted: type) -> UserError:
+def _wrong_method(path: str | Path | None, checkpoint: dict[str, Any], wanted: type) -> UserError:
     name = str(checkpoint.get("method", "an unknown method")).rpartition(".")[2]
     return UserError(
-        f"checkpoint is of {name}, not {wanted.__name__}: give the model configuration it was trained with, "
-        "or another checkpoint"
+        f"{path or 'given'}: checkpoint is of {name}, not {wanted.__name__}: "
+        "give the model configuration it was trained with, or another checkpoint"
     )

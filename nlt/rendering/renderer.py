@@ -85,7 +85,7 @@ class Renderer:
             "to_world": mi.ScalarTransform4f(view_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
             "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
         })  # fmt: skip
-        image = mi.render(self.scene.mi_scene, sensor=sensor, integrator=self.integrator, spp=spp, seed=seed)
+        image = mi.render(self.scene.mi_scene, sensor=sensor, integrator=self.integrator, spp=spp, seed=mi.UInt32(seed))
         return np.moveaxis(np.array(image)[..., :3], 2, 0).astype(np.float32)
 
     def _camera_values(self, camera: Camera) -> dict[str, Any]:

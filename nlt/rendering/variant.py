@@ -49,7 +49,7 @@ def choose_variant() -> Variant:
         if name not in VARIANTS:
             raise UserError(f"NLT_VARIANT: must be one of {', '.join(VARIANTS)} or unset, is {name!r}")
         return Variant(name, "set by NLT_VARIANT")
-    failed = []
+    failed: list[str] = []
     for name in VARIANTS[:-1]:
         for library in _llvm_libraries() if name.startswith("llvm") else [None]:
             if _works(name, library):

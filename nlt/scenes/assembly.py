@@ -152,7 +152,7 @@ class Scene:
         matrix = np.eye(4)
         matrix[:3, :3] = _facing_down(self.description.up) * [light.size[0] / 2, light.size[1] / 2, 1] * units
         matrix[:3, 3] = (light.centre + translation) * units
-        return mi.ScalarTransform4f(matrix)
+        return mi.ScalarTransform4f(matrix.tolist())
 
     def set_state(self, state: SceneState) -> None:
         """Move and remove objects; the next rays see the new state."""

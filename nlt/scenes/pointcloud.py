@@ -29,7 +29,7 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
     areas = [shape.face_areas for shape in shapes]
     owner = {name: k for k, movable in enumerate(scene.movables) for name in movable.shapes}
     which = sample_cdf(np.array([a.sum() for a in areas]), rng.random(count))
-    points = {
+    points: dict[str, np.ndarray] = {
         "position": np.zeros((count, 3), np.float32),
         "material": np.zeros(count, np.uint8),
         "albedo": np.zeros((count, 3), np.float32),
@@ -88,7 +88,7 @@ def _surface(shape: Shape, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         interaction.uv = uv
         interaction.wi = mi.Vector3f(0, 0, 1)
-        interaction.t = 1.0
+        interaction.t = mi.Float(1)  # type: ignore[assignment]
         emitted = shape.emitter.eval(interaction) if shape.emitter else mi.Color3f(0 * uv.x)
         return diffuse_albedo(shape.bsdf, interaction), mi.Color3f(emitted)
 

