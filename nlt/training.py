@@ -33,6 +33,7 @@ _NOISE = (
     ".*GPU available but not used.*",
     ".*LightningCLI's args parameter.*",
     ".*The dirpath has changed.*",
+    ".*Checkpoint directory .* exists and is not empty.*",
 )
 # Checkpoints that Lightning finds by itself.
 _LIGHTNINGS_OWN = ("best", "last", "hpc")
@@ -43,6 +44,13 @@ class Checkpoints(ModelCheckpoint):
 
     def __init__(self) -> None:
         super().__init__(filename="{epoch}-{step}", save_top_k=1, save_on_train_epoch_end=True)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Resuming with max_steps, Lightning ends the last epoch anew and would count it twice: the sampler's epoch."""
+        super().on_train_start(trainer, pl_module)
+        progress: Any = trainer.fit_loop.epoch_progress
+        for tracker in (progress.current, progress.total):
+            tracker.processed = tracker.completed
 
 
 class Predictions(BasePredictionWriter):

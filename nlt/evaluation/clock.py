@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from nlt.data.datamodule import LightTransportDataset
-from nlt.data.generate import SampleRenderer
+from nlt.data.render import SampleRenderer
 from nlt.models.module import RenderingModule
 
 WARM_UP, FRAMES = 10, 40

@@ -144,7 +144,12 @@ class FID(FrechetInceptionDistance):
         """Scalar."""
         if min(self.real_features_num_samples, self.fake_features_num_samples) < 2:
             return torch.full((), torch.nan, dtype=torch.float64, device=self.real_features_sum.device)
-        return super().compute()
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # on busy cores LAPACK's eigenvalues take many times as long with several
+        try:
+            return super().compute()
+        finally:
+            torch.set_num_threads(threads)
 
 
 class ImageMetrics(nn.Module):

@@ -15,7 +15,7 @@ import numpy as np
 
 from nlt.errors import UserError
 from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
-from nlt.scenes.lanes import is_jit
+from nlt.scenes.lanes import is_jit, owned
 from nlt.scenes.state import SceneState, rest_state
 
 # A removed object shrinks to a speck of a micrometre: no ray meets it, and no kernel has to be compiled anew for
@@ -170,7 +170,7 @@ class Scene:
             for key, rest in self._moving_meshes[movable.name].items():
                 centre = self._centre(movable) * units
                 moved = (rest - centre) * scale + centre + offset
-                self._parameters[key] = _owned(moved.ravel()) if is_jit() else moved.ravel().tolist()
+                self._parameters[key] = owned(moved.astype(np.float32))
         if len(self._parameters):
             self._parameters.update()
             if is_jit():
@@ -186,13 +186,6 @@ class Scene:
     def _centre(self, movable: Movable) -> np.ndarray:
         vertices = np.concatenate([self.shapes[name].vertices for name in movable.shapes])
         return (vertices.min(0) + vertices.max(0)) / 2
-
-
-def _owned(values: np.ndarray) -> Any:
-    """An array in memory of Dr.Jit's own: with numpy's, Embree is seen to read freed memory under frozen kernels."""
-    array = mi.Float(values.astype(np.float32)) + dr.opaque(mi.Float, 0)
-    dr.eval(array)
-    return array
 
 
 def _some(names: set[str]) -> str:

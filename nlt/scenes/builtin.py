@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from nlt.scenes.lanes import owned
+
 
 @dataclass(frozen=True)
 class BuiltinShape:
@@ -405,12 +407,12 @@ def mitsuba_scene(name: str) -> mi.Scene:
         )
         mesh.set_id(key)
         params = mi.traverse(mesh)
-        params["vertex_positions"] = np.ravel(shape.mesh.vertices).astype(np.float32)
-        params["faces"] = np.ravel(shape.mesh.faces).astype(np.uint32)
+        params["vertex_positions"] = owned(np.asarray(shape.mesh.vertices, np.float32))
+        params["faces"] = owned(np.asarray(shape.mesh.faces, np.uint32))
         if shape.uv is not None:
-            params["vertex_texcoords"] = np.ravel(shape.uv).astype(np.float32)
+            params["vertex_texcoords"] = owned(np.asarray(shape.uv, np.float32))
         if shape.smooth:
-            params["vertex_normals"] = np.ravel(shape.mesh.vertex_normals).astype(np.float32)
+            params["vertex_normals"] = owned(np.asarray(shape.mesh.vertex_normals, np.float32))
         params.update()
         meshes[key] = mesh
     return mi.load_dict({"type": "scene", **meshes})

@@ -15,6 +15,19 @@ def is_jit() -> bool:
     return bool(dr.is_jit_v(mi.Float))
 
 
+def owned(values: np.ndarray) -> Any:
+    """Flat float32 or uint32 values for a mesh parameter, in memory of Dr.Jit's own.
+
+    With numpy's, Embree was seen to read freed memory under frozen kernels.
+    """
+    if not is_jit():
+        return values.ravel().tolist()
+    kind = mi.Float if values.dtype.kind == "f" else mi.UInt32
+    array: Any = kind(values.ravel()) + dr.opaque(kind, 0)  # type: ignore[operator]
+    dr.eval(array)
+    return array
+
+
 def launch(kernel: Callable, lanes: Mapping[str, tuple[str, np.ndarray]], **fixed: Any) -> tuple[np.ndarray, ...]:
     """Run `kernel(**fixed, **lanes)` over all lanes.
 

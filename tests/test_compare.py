@@ -1,0 +1,267 @@
+"""`nlt compare` over every method there is: its files, its numbers, and what it does when run again."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage.metrics import structural_similarity
+from tiny import DATASET, SCALE, use_tiny_inception, write
+from torch.utils.data import default_collate
+
+from nlt import paths, training
+from nlt.cli import main
+from nlt.data.datamodule import LightTransportDataset
+from nlt.data.spec import DatasetSpec, merge
+from nlt.evaluation import clock, compare
+from nlt.models.module import RenderingModule
+from nlt.paths import CONFIGS, PROJECT
+
+pytest_plugins = ["training_fixtures"]
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ACCURACY = ("mse", "unbiased_mse", "reference_noise", "mssim", "fid", "feature_l1")
+STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis")
+STEPS = 6  # 4 to an epoch
+# A method that nothing in the package knows of.
+EXTRA = """
+from nlt.baselines.cnn import CNN
+
+class Extra(CNN):
+    stages = ("photons", "gbuffer")
+"""
+
+
+class World(SimpleNamespace):
+    """Its own directory, configs and methods; `compare` runs there and returns the table's rows by method."""
+
+    def compare(self, *more, out="again"):
+        assert main(["compare", "--config", str(self.config), f"--out={out}", *more]) == 0
+        with (self.folder / out / "table.csv").open(newline="") as file:
+            return {row["method"]: row for row in csv.DictReader(file)}
+
+    def run(self, method):
+        """The newest directory of a method's training."""
+        found = self.folder.glob(f"runs/*/{method}-" + "[0-9a-f]" * 8)
+        return max(found, key=lambda path: path.stat().st_mtime)
+
+    def checkpoint(self, method):
+        (path,) = self.run(method).glob("checkpoints/*.ckpt")
+        return path
+
+
+@pytest.fixture(scope="module")
+def world(tiny, tmp_path_factory, one_thread):
+    """A first comparison of all methods; `frames`: what the clock measured, in order."""
+    folder = tmp_path_factory.mktemp("world")
+    shutil.copytree(CONFIGS, folder / "configs")
+    write(folder / "extra_method.py", EXTRA)
+    write(folder / "configs/model/extra.yaml", {"model": {"class_path": "extra_method.Extra"}})
+    scale = merge(SCALE, {"trainer": {"max_steps": STEPS, "max_epochs": -1, "enable_progress_bar": False}})
+    content = {"table": "table2", "data": str(tiny.data), "scale": str(write(folder / "scale.yaml", scale)), "seed": 3}
+    frames = []
+    original = clock.Clock._frame
+
+    def spy(self, module, index):
+        frames.append(original(self, module, index))
+        return frames[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        patch.setattr(paths, "CONFIGS", folder / "configs")
+        patch.setattr(compare, "CONFIGS", folder / "configs")
+        patch.setattr(clock, "WARM_UP", 1)
+        patch.setattr(clock, "FRAMES", 3)
+        patch.setattr(clock.Clock, "_frame", spy)
+        config = write(folder / "tiny.yaml", content)
+        patch.setattr(sys, "argv", ["nlt", "compare", "--config", str(config), "--out=out"])
+        use_tiny_inception(patch)
+        made = World(folder=folder, config=config, frames=frames, tiny=tiny)
+        made.rows = made.compare(out="out")
+        made.measured = list(frames)
+        yield made
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    """The trainings that are begun, as their arguments."""
+    begun = []
+    original = training.run_lightning
+    monkeypatch.setattr(training, "run_lightning", lambda arguments: (begun.append(arguments), original(arguments))[1])
+    return begun
+
+
+def methods():
+    return {path.stem for path in (CONFIGS / "model").glob("*.yaml")}
+
+
+def test_table(world):
+    """One row for every config, the added method's included; the paper's columns come first."""
+    assert set(world.rows) == methods() | {"extra"}
+    with (world.folder / "out/table.csv").open() as file:
+        header = file.readline().strip()
+    assert header.startswith("method,time_per_frame_s,mse,mssim,fid,feature_l1,n_test,seed,")
+    for row in world.rows.values():
+        assert (row["n_test"], row["seed"], row["steps"]) == ("3", "3", str(STEPS))
+        assert all(np.isfinite(float(row[name])) for name in ACCURACY)
+
+
+def test_time_is_the_sum_of_the_stages_medians(world):
+    """Over the frames after the warm-up, of exactly the stages that the method declares."""
+    for k, (name, row) in enumerate(world.rows.items()):
+        module = RenderingModule.load_from_checkpoint(world.checkpoint(name))
+        stages = {stage for stage in STAGES if row[f"{stage}_s"]}
+        assert stages == {*module.stages, "transport", "projection", "synthesis"}, name
+        frames = world.measured[4 * k + 1 : 4 * k + 4]
+        medians = {stage: statistics.median(frame[stage] for frame in frames) for stage in stages}
+        for stage, seconds in medians.items():
+            assert float(row[f"{stage}_s"]) == pytest.approx(seconds)
+        assert float(row["time_per_frame_s"]) == pytest.approx(sum(medians.values()))
+    assert "photons" in RenderingModule.load_from_checkpoint(world.checkpoint("extra")).stages
+
+
+def test_metrics_are_those_of_the_predictions(world):
+    module = RenderingModule.load_from_checkpoint(world.checkpoint("nlt_photons")).eval()
+    dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test")
+    mse, mssim = [], []
+    for k in range(3):
+        batch = default_collate([dataset[k]])
+        with torch.no_grad():
+            prediction = module(batch)
+        pair = [shown(x, batch) for x in (prediction, (batch["reference_a"] + batch["reference_b"]) / 2)]
+        mse.append(np.mean((pair[0] - pair[1]) ** 2))
+        f, r = (np.pad(x, ((3, 3), (3, 3), (0, 0)), mode="reflect") for x in pair)
+        options = {"win_size": 7, "data_range": 1.0, "channel_axis": -1, "use_sample_covariance": False}
+        mssim.append(structural_similarity(f, r, **options))
+    row = world.rows["nlt_photons"]
+    assert float(row["mse"]) == pytest.approx(np.mean(mse), rel=1e-5)
+    assert float(row["mssim"]) == pytest.approx(np.mean(mssim), abs=1e-5)
+
+
+def shown(image, batch):
+    """(H, W, 3): exposed, clamped, sRGB."""
+    x = np.clip(image[0].permute(1, 2, 0).double().numpy() * batch["exposure"].item(), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def test_the_papers_figures_stand_beside_ours(world):
+    lines = (world.folder / "out/table.md").read_text().partition("Milliseconds")[0].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    accuracy = {name: cells for name, *cells in rows}
+    theirs = {
+        "CNN only": [0.019, 0.01, 0.827, 33.7, 0.199],
+        "Ours (w/ photons)": [0.0468, 0.0014, 0.887, 25.1, 0.172],
+        "Denoising (1/4)": [0.3801, 0.0002, 0.923, 17.6, 0.143],
+    }
+    for name, figures in theirs.items():
+        assert [float(cell.split(" / ")[1]) for cell in accuracy[name]] == figures
+    ours = float(accuracy["CNN only"][1].split(" / ")[0])
+    assert ours == pytest.approx(float(world.rows["cnn"]["mse"]), abs=1e-5)
+    assert "/" not in "".join(accuracy["extra"])
+
+
+def test_pictures(world):
+    """A row per view, a column per method between the noisy image and the reference; nothing is black."""
+    image = np.asarray(Image.open(world.folder / "out/samples.png").convert("RGB")) / 255
+    columns, views, title = len(world.rows) + 2, 3, int(0.35 * 150)
+    height, width = (image.shape[0] - title) / views, image.shape[1] / columns
+    dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test", ())
+    for i in range(views):
+        batch = default_collate([dataset[i]])
+        for j in range(columns):
+            y, x = title + int((i + 0.5) * height), int((j + 0.5) * width)
+            half = int(0.3 * width)
+            tile = image[y - half : y + half, x - half : x + half]
+            assert 0.02 < tile.mean() < 0.98 and tile.std() > 0.005, (i, j)
+        for j, target in ((0, batch["noisy"]), (columns - 1, (batch["reference_a"] + batch["reference_b"]) / 2)):
+            y, x = title + int((i + 0.5) * height), int((j + 0.5) * width)
+            tile = image[y - half : y + half, x - half : x + half]
+            expected = shown(target, batch)[3:13, 3:13]
+            assert np.abs(tile.mean((0, 1)) - expected.mean((0, 1))).max() < 0.06, (i, j)
+    curves = np.asarray(Image.open(world.folder / "out/speed_accuracy.png").convert("RGB"))
+    assert curves.shape[1] > curves.shape[0] > 300 and curves.std() > 5
+
+
+def test_manifest(world):
+    record = json.loads((world.folder / "out/manifest.json").read_text())
+    assert record["command"] == f"nlt compare --config {world.config} --out=out"
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=PROJECT, capture_output=True, text=True, check=False)
+    assert record["commit"] is None if commit.returncode else re.fullmatch("[0-9a-f]{40}", record["commit"])
+    assert set(record["configs"]) == set(world.rows) == set(record["training"])
+    assert record["configs"]["denoising_1_4"]["model"]["init_args"] == {"one_in": 4, "width": 2}
+    assert (record["seed"], record["n_test"]) == (3, 3)
+    assert record["versions"]["torch"] == torch.__version__
+    assert record["wall_time_s"] > 0 and record["device"]
+
+
+# ---- run again ------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_trained_twice(world, trainings):
+    again = world.compare("--methods", "cnn", "nlt_photons", "denoising_1_4")
+    assert trainings == []
+    for name, row in again.items():
+        assert {key: row[key] for key in ACCURACY} == {key: world.rows[name][key] for key in ACCURACY}
+
+
+def test_one_methods_config_retrains_this_method(world, trainings):
+    file = world.folder / "configs/model/feature_projection.yaml"
+    before = file.read_text()
+    file.write_text(before + "  init_args:\n    learning_rate: 0.01\n")
+    try:
+        rows = world.compare("--methods", "cnn", "feature_projection")
+        assert len(trainings) == 1 and f"--config={file}" in trainings[0]
+        assert rows["feature_projection"]["mse"] != world.rows["feature_projection"]["mse"]
+        assert rows["cnn"]["mse"] == world.rows["cnn"]["mse"]
+    finally:
+        file.write_text(before)
+    rows = world.compare("--methods", "feature_projection")
+    assert len(trainings) == 1 and rows["feature_projection"]["mse"] == world.rows["feature_projection"]["mse"]
+
+
+def test_a_killed_training_goes_on(world, trainings, monkeypatch):
+    """Killed in the second epoch, while a checkpoint was being written: what comes out is as if nothing had been."""
+    whole = torch.load(world.checkpoint("nlt"), weights_only=True)
+    run = world.run("nlt")
+    shutil.rmtree(run)
+    step = RenderingModule.training_step
+
+    def killed(self, batch, batch_idx):
+        if self.global_step == STEPS - 1:
+            raise SystemError("killed")
+        return step(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RenderingModule, "training_step", killed)
+        with pytest.raises(SystemError):
+            world.compare("--methods", "nlt")
+    assert not (run / "done.json").exists()
+    kept = world.checkpoint("nlt")
+    assert torch.load(kept, weights_only=True)["global_step"] == 4
+    truncated = run / "checkpoints/epoch=7-step=99.ckpt"
+    truncated.write_bytes(kept.read_bytes()[:-1000])
+    os.utime(truncated, (2**31, 2**31))
+
+    row = world.compare("--methods", "nlt")["nlt"]
+    assert f"--ckpt_path={kept}" in trainings[-1] or f"--ckpt_path={kept.relative_to(world.folder)}" in trainings[-1]
+    assert row["steps"] == str(STEPS) and row["mse"] == world.rows["nlt"]["mse"]
+    resumed = torch.load(training.newest_checkpoint(run), weights_only=True)
+    assert all(torch.equal(resumed["state_dict"][name], value) for name, value in whole["state_dict"].items())
+
+
+def test_a_lost_mark_costs_no_step(world, trainings):
+    """Killed between the last checkpoint and done.json: the training is found finished."""
+    (world.run("cnn") / "done.json").unlink()
+    row = world.compare("--methods", "cnn")["cnn"]
+    assert len(trainings) == 1 and any(argument.startswith("--ckpt_path=") for argument in trainings[0])
+    assert row["steps"] == str(STEPS) and row["mse"] == world.rows["cnn"]["mse"]

@@ -1,0 +1,163 @@
+"""Training and evaluation through the command line's parser, on a tiny dataset."""
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from safetensors.numpy import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny import DATASET, copy_dataset, use_tiny_inception, write
+from torch.utils.data import DataLoader, default_collate
+
+from nlt.baselines.cnn import CNN
+from nlt.cli import main
+from nlt.data.datamodule import LightTransportDataset
+from nlt.data.spec import DatasetSpec
+from nlt.data.store import write_shard
+from nlt.metrics.image_metrics import METRICS
+from nlt.models.module import RenderingModule
+from nlt.training import run_lightning
+
+pytest_plugins = ["training_fixtures"]
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def content(tensors):
+    """All tensors within, as bytes."""
+    if isinstance(tensors, torch.Tensor):
+        return tensors.numpy().tobytes()
+    if isinstance(tensors, dict):
+        return {key: content(value) for key, value in tensors.items()}
+    return [content(value) for value in tensors] if isinstance(tensors, list | tuple) else tensors
+
+
+@pytest.mark.parametrize(
+    ("method", "limit", "legs"),
+    [("nlt_photons", "max_steps", (4, 8, 10)), ("denoising_1_4", "max_steps", (4, 6)), ("cnn", "max_epochs", (1, 2))],
+)
+def test_resuming_is_exact(tiny, method, limit, legs):
+    """In one go or killed after an epoch, and again: the same parameters and optimiser to the bit."""
+
+    def run(length, *more):
+        limits = {"max_steps": -1, "max_epochs": -1, limit: length}
+        trainer = run_lightning(
+            tiny.command("fit", method, *(f"--trainer.{name}={value}" for name, value in limits.items()), *more)
+        ).trainer
+        path = trainer.checkpoint_callback.best_model_path
+        checkpoint = torch.load(path, weights_only=True)
+        return path, content([checkpoint[key] for key in ("state_dict", "optimizer_states", "lr_schedulers", "epoch")])
+
+    _, through = run(legs[-1])
+    path, state = run(legs[0])
+    for length in legs[1:]:
+        assert state != through
+        torch.manual_seed(123)
+        path, state = run(length, f"--ckpt_path={path}", "--seed_everything=99")
+    assert state == through
+
+
+def test_seed(tiny):
+    def losses(seed):
+        trainer = run_lightning(tiny.command("fit", "cnn", f"--seed_everything={seed}")).trainer
+        return trainer.callback_metrics["train/loss"].item()
+
+    assert losses(0) == losses(0) != losses(1)
+
+
+def test_two_processes(tiny, tmp_path):
+    """Each epoch's samples are dealt out without overlap; an odd number is validated as by one process."""
+    recorder = {"class_path": "tiny.Recorder", "init_args": {"directory": str(tmp_path)}}
+    two = {"max_epochs": 2, "devices": 2, "strategy": "ddp_spawn", "callbacks": [recorder]}
+    config = write(tmp_path / "two.yaml", {"trainer": two})
+    trainer = run_lightning(tiny.command("fit", "cnn", f"--config={config}")).trainer
+    assert DATASET["val"] % 2 == 1
+    for epoch in range(2):
+        ranks = [sorted((tmp_path / f"{epoch}-{rank}").read_text().split()) for rank in range(2)]
+        assert len(ranks[0]) == len(ranks[1]) == DATASET["train"] // 2
+        assert sorted(ranks[0] + ranks[1]) == [str(index) for index in range(DATASET["train"])]
+    path = trainer.checkpoint_callback.best_model_path
+    one = run_lightning(tiny.command("validate", "cnn", f"--ckpt_path={path}")).trainer.callback_metrics
+    names = [f"val/{name}" for name in ("mse", "mssim", "unbiased_mse", "reference_noise")]
+    for name in names:
+        assert trainer.callback_metrics[name].item() == pytest.approx(one[name].item(), rel=1e-6), name
+
+
+def test_sample_that_is_not_finite(tiny, tmp_path, capfd):
+    """A NaN with a valid CRC: training stops, and says in which samples to look."""
+    directory, config = copy_dataset(tiny, tmp_path)
+    shard = directory / "train/000-0000004.safetensors"
+    arrays = {name: array.copy() for name, array in load_file(shard).items() if not name.startswith("crc:")}
+    arrays["noisy"][2, 1, 5, 5] = np.nan
+    write_shard(shard, [{name: array[k] for name, array in arrays.items()} for k in range(4)])
+    capfd.readouterr()
+    assert main(tiny.command("fit", "cnn", f"--config={config}", f"--trainer.default_root_dir={tmp_path}")) == 2
+    error = capfd.readouterr().err
+    assert error.startswith("nlt: error: train/loss is nan at step ") and error.count("\n") == 1
+    samples = error.partition("samples [")[2].partition("]")[0].split(", ")
+    assert len(samples) == 2 and str(4 + 2) in samples
+
+
+def test_events(tiny, trained):
+    events = EventAccumulator(str(trained)).Reload()
+    values = {tag: [event.value for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    assert len(values["train/loss"]) == 4 and np.isfinite(values["train/loss"]).all()
+    assert values["lr-Adam"] == pytest.approx([5e-4])
+    for name in ("mse", "mssim", "unbiased_mse", "reference_noise"):
+        assert np.isfinite(values[f"val/{name}"]).all(), name
+    (image,) = events.Images("val/images")
+    assert (image.width, image.height) == (4 * 16, 3 * 16)
+    assert yaml.safe_load((trained / "config.yaml").read_text())["model"]["init_args"]["width"] == 2
+
+
+def test_checkpoint_is_read_without_pickle(checkpoint):
+    saved = torch.load(checkpoint, weights_only=True)
+    assert saved["method"] == "nlt.baselines.cnn.CNN" and saved["global_step"] == 4
+
+
+def test_evaluation_commands(tiny, checkpoint, tmp_path, monkeypatch, capsys):
+    use_tiny_inception(monkeypatch)
+    place = [f"--ckpt_path={checkpoint}", f"--trainer.default_root_dir={tmp_path}"]
+    assert main(tiny.command("validate", "cnn", *place)) == 0
+    assert "val/unbiased_mse" in capsys.readouterr().out
+    logged = run_lightning(tiny.command("test", "cnn", *place)).trainer.callback_metrics
+    assert set(logged) == {f"test/{name}" for name in METRICS}
+    assert all(value.isfinite() for value in logged.values())
+
+    capsys.readouterr()
+    assert main(tiny.command("predict", "cnn", *place)) == 0
+    printed = capsys.readouterr().out.split()[-1]
+    images = sorted((tmp_path / printed).iterdir())
+    assert [image.name for image in images] == ["0000000.png", "0000001.png", "0000002.png"]
+    dataset = LightTransportDataset(tiny.dataset, DatasetSpec(**DATASET), "test")
+    batch = default_collate([dataset[2]])
+    with torch.no_grad():
+        radiance = RenderingModule.load_from_checkpoint(checkpoint).eval()(batch)[0].permute(1, 2, 0).double().numpy()
+    exposed = np.clip(radiance * batch["exposure"].item(), 0, 1)
+    srgb = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
+    assert np.abs(np.asarray(Image.open(images[2])) - 255 * srgb).max() <= 0.51
+
+
+def test_an_easy_task_is_learnt(tiny, tmp_path):
+    """Four samples whose image is half the albedo."""
+    dataset = LightTransportDataset(tiny.dataset, DatasetSpec(**DATASET), "train")
+    batch = default_collate([dataset[k] for k in range(4)])
+    batch["noisy"] = batch["albedo"] / 2 + 0.1
+    torch.manual_seed(0)
+    method = CNN(width=8, loss="relative_mse", learning_rate=5e-3)
+
+    def loss():
+        with torch.no_grad():
+            return method.loss(method(batch), batch["noisy"], batch["exposure"]).item()
+
+    first = loss()
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = L.Trainer(accelerator="cpu", max_steps=60, enable_model_summary=False, default_root_dir=tmp_path, **quiet)
+    trainer.fit(method, DataLoader([batch] * 60, batch_size=None))
+    assert loss() < first / 2
