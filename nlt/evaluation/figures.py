@@ -98,7 +98,7 @@ def _scatter(pixels: Tensor, colours: Tensor, height: int, width: int) -> Tensor
 def draw_speed_accuracy(path: Path, rows: list[dict[str, Any]]) -> None:
     """Accuracy over time per frame, a panel per metric; methods that trace pixels are one curve."""
     figure, axes = plt.subplots(1, len(_PANELS), figsize=(4 * len(_PANELS), 3.6))
-    traced = sorted((row for row in rows if row["pixel_fraction"] > 0), key=lambda row: row["time_per_frame_s"])
+    traced = sorted((row for row in rows if row["pixel_fraction"] > 0), key=lambda row: row["pixel_fraction"])
     others = [row for row in rows if row["pixel_fraction"] == 0]
     markers = "osD^vP*X"
     for axis, key in zip(axes, _PANELS, strict=True):
