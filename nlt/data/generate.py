@@ -18,6 +18,7 @@ from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, Shard
 from nlt.data.store import MANIFEST, missing_files, points_path, write_manifest, write_shard
 from nlt.errors import UserError
+from nlt.rendering.variant import choose_variant
 
 # Mitsuba's memory grows with every scene and state: a worker renders so many samples and ends.
 _SAMPLES_PER_WORKER = 1024
@@ -38,7 +39,9 @@ def generate(spec: DatasetSpec, root: Path, workers: int | None = None) -> Path:
     for leftover in directory.glob("**/.*.tmp"):
         if not _alive(int(leftover.name.split(".")[-2])):
             leftover.unlink(missing_ok=True)
-    write_manifest(directory, spec)
+    variant = choose_variant()
+    write_manifest(directory, spec, f"{variant.name}: {variant.reason}")
+    print(f"rendering with {variant.name}: {variant.reason}", flush=True)
     shards = [shard for shard in spec.shards() if directory / shard.name in missing]
     _announce(spec, directory, shards, workers or _cores())
     jobs = _plan(spec, shards, missing, directory, workers or _cores())

@@ -109,9 +109,9 @@ def points_path(directory: Path, scene: int) -> Path:
     return directory / f"points-{scene:03d}.safetensors"
 
 
-def write_manifest(directory: Path, spec: DatasetSpec) -> None:
-    """Record what the dataset is made of; the same spec writes the same bytes."""
-    write_bytes(directory / MANIFEST, json.dumps(spec.manifest, indent=1).encode())
+def write_manifest(directory: Path, spec: DatasetSpec, variant: str) -> None:
+    """Record what the dataset is made of and what rendered it; the same two write the same bytes."""
+    write_bytes(directory / MANIFEST, json.dumps(spec.manifest | {"variant": variant}, indent=1).encode())
 
 
 def missing_files(directory: Path, spec: DatasetSpec) -> list[Path]:

@@ -21,7 +21,7 @@ from nlt.errors import UserError
 from nlt.evaluation.clock import Clock
 from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
 from nlt.evaluation.paper import order
-from nlt.evaluation.provenance import manifest
+from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.module import Batch, RenderingModule
@@ -93,7 +93,7 @@ def compare(
     methods: list[str] | None = None,
 ) -> Path:
     """Everything that a table needs, of which what is there already is kept. Returns its directory."""
-    start = time.time()
+    start, begun = time.time(), origin()
     comparison = Comparison.load(config, scale, data, methods)
     directory = Path(out or Path("results") / comparison.name)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
@@ -122,7 +122,10 @@ def compare(
     print("\n" + "\n".join([live_header(), *(live_row(row) for row in rows)]))
     draw_samples(directory / "samples.png", test.views(), predictions)
     draw_speed_accuracy(directory / "speed_accuracy.png", rows)
-    record = manifest(start, device) | {
+    record = {
+        **begun,
+        "wall_time_s": round(time.time() - start, 1),
+        **surroundings(device),
         "comparison": comparison.name,
         "seed": comparison.seed,
         "dataset": dataset.name,

@@ -22,13 +22,20 @@ from nlt.rendering.variant import choose_variant
 _PACKAGES = ("nlt", "torch", "lightning", "torchmetrics", "mitsuba", "drjit", "numpy", "safetensors")
 
 
-def manifest(start: float, device: torch.device) -> dict[str, Any]:
-    """What a result file says of its origin. `start`: when the command began, seconds since the epoch."""
-    variant, weights = choose_variant(), find_weights()
+def origin() -> dict[str, Any]:
+    """Command, commit and time, taken when the command begins: the checkout may change while it runs."""
     return {
         "command": shlex.join(["nlt", *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!results")),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def surroundings(device: torch.device) -> dict[str, Any]:
+    """What else decides a result: device, versions, how it was timed."""
+    variant, weights = choose_variant(), find_weights()
+    return {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
         "threads": torch.get_num_threads(),
         "platform": platform.platform(),
@@ -37,8 +44,6 @@ def manifest(start: float, device: torch.device) -> dict[str, Any]:
         "mitsuba_variant": f"{variant.name}: {variant.reason}",
         "inception_weights": Path(weights).name if weights else None,
         "clock": {"batch": 1, "warm_up_frames": WARM_UP, "timed_frames": FRAMES, "precision": "float32"},
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
-        "wall_time_s": round(time.time() - start, 1),
     }
 
 

@@ -48,6 +48,8 @@ def choose_variant() -> Variant:
         name = os.environ["NLT_VARIANT"]
         if name not in VARIANTS:
             raise UserError(f"NLT_VARIANT: must be one of {', '.join(VARIANTS)} or unset, is {name!r}")
+        if name.startswith("llvm") and (library := next(iter(_llvm_libraries()), None)):
+            os.environ[_LIBRARY] = library
         return Variant(name, "set by NLT_VARIANT")
     failed: list[str] = []
     for name in VARIANTS[:-1]:
@@ -55,12 +57,16 @@ def choose_variant() -> Variant:
             if _works(name, library):
                 if library:
                     os.environ[_LIBRARY] = library
-                reason = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
-                # Worker processes inherit the choice and do not probe again.
-                os.environ["NLT_VARIANT"] = name
-                return Variant(name, reason)
+                why = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
+                return _chosen(name, why)
         failed.append(f"{name} does not work here")
-    return Variant(VARIANTS[-1], "; ".join(failed))
+    return _chosen(VARIANTS[-1], "; ".join(failed))
+
+
+def _chosen(name: str, reason: str) -> Variant:
+    # Worker processes inherit the choice and do not probe again.
+    os.environ["NLT_VARIANT"] = name
+    return Variant(name, reason)
 
 
 def _llvm_libraries() -> list[str | None]:
