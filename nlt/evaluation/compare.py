@@ -165,6 +165,7 @@ def train(comparison: Comparison, method: str, root: Path) -> tuple[Path, dict[s
         batch = cli.datamodule.batch_size * cli.trainer.world_size
         steps = cli.trainer.global_step
         took = {"train_s": time.time() - begin, "steps": steps, "images_seen": steps * batch}
+        took["trained_at_commit"] = origin()["commit"]
         checkpoint = newest_checkpoint(run)
         assert checkpoint is not None
         done.write_text(json.dumps(took | {"resumed": len(arguments) > 1 + len(files) + 1}))
