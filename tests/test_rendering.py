@@ -443,7 +443,9 @@ def test_variant_order(probing):
     fallback = choose()
     assert probed == order and fallback.name == "scalar_rgb"
     assert "cuda_ad_rgb" in fallback.reason and "llvm_ad_rgb" in fallback.reason
+    assert os.environ["NLT_VARIANT"] == "scalar_rgb"  # worker processes need not probe
 
+    del os.environ["NLT_VARIANT"]
     probed.clear()
     ok.add(order[2])
     chosen = choose()
