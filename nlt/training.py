@@ -114,7 +114,6 @@ def run_lightning(arguments: list[str]) -> NLTCLI:
         logging.getLogger(name).setLevel(logging.WARNING)
     for pattern in _NOISE:
         warnings.filterwarnings("ignore", pattern)
-    torch.set_float32_matmul_precision("high")
     given = _check_configs(arguments)
     try:
         return NLTCLI(

@@ -1,5 +1,5 @@
 #!/bin/sh
-# What pip cannot install: the venv module, and a libLLVM that Mitsuba can use (three times faster than without).
+# What pip cannot install: the venv module, and a libLLVM that Mitsuba can use, for speed.
 # Both are installed where we may (root on Debian or Ubuntu); else this says what is missing.
 set -u
 python=${PYTHON:-python3}

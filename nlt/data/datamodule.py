@@ -53,9 +53,8 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """One sample; floats are float32."""
         scene, row = divmod(index, self.spec.count(self.split))
-        start = row - row % self.spec.shard_size
-        path = self.directory / self.split / f"{scene:03d}-{start:07d}.safetensors"
-        stored = self._reader.read(path, row - start, self._stored)
+        shard = self.spec.shard(self.split, scene, row)
+        stored = self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
         sample = {name: _tensor(array) for name, array in stored.items()}
         if self._wants("view_direction"):
             size = self.spec.resolution

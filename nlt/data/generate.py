@@ -15,6 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from nlt.data.render import SampleRenderer
+from nlt.data.sample import SPLITS
 from nlt.data.spec import DatasetSpec, Shard
 from nlt.data.store import MANIFEST, missing_files, points_path, write_manifest, write_shard
 from nlt.errors import UserError
@@ -65,7 +66,7 @@ def _alive(pid: int) -> bool:
 
 def _announce(spec: DatasetSpec, directory: Path, shards: list[Shard], workers: int) -> None:
     """Say what it will take before it starts; refuse what the disk cannot hold."""
-    samples = {split: sum(s.stop - s.start for s in shards if s.split == split) for split in ("train", "val", "test")}
+    samples = {split: sum(s.stop - s.start for s in shards if s.split == split) for split in SPLITS}
     size = sum(count * spec.nbytes(split) for split, count in samples.items())
     free = shutil.disk_usage(directory).free
     if size > free:

@@ -55,8 +55,9 @@ class SampleRenderer:
         state = self.scene.state
         seeds = spec.seeds(split, self.index, index).generate_state(5)
         noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds)
-        moved = np.zeros((spec.sizes["M"], 3), np.float32)
-        present = np.zeros(spec.sizes["M"], bool)
+        fields, sizes = spec.fields(split), spec.sizes
+        moved = np.zeros((sizes["M"], 3), np.float32)
+        present = np.zeros(sizes["M"], bool)
         moved[: len(state.present)], present[: len(state.present)] = state.translation, state.present
         sample: dict[str, np.ndarray] = {
             "noisy": self._radiance(camera, spec.noisy_spp, noisy),
@@ -68,12 +69,12 @@ class SampleRenderer:
             "translation": moved,
             "present": present,
         }
-        if split != "train":
+        if "reference_a" in fields:
             sample["reference_a"] = self._radiance(camera, spec.reference_spp, half_a)
             sample["reference_b"] = self._radiance(camera, spec.reference_spp, half_b)
         return {
-            name: np.ascontiguousarray(sample[name], field.dtype).reshape(field.resolve(spec.sizes))
-            for name, field in spec.fields(split).items()
+            name: np.ascontiguousarray(sample[name], field.dtype).reshape(field.resolve(sizes))
+            for name, field in fields.items()
         }
 
     def _radiance(self, camera: Any, spp: int, seed: int) -> np.ndarray:

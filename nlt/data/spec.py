@@ -120,11 +120,16 @@ class DatasetSpec:
     def shards(self) -> list[Shard]:
         """Every shard of the dataset, the evaluated splits first."""
         return [
-            Shard(split, scene, start, min(start + self.shard_size, self.count(split)))
+            self.shard(split, scene, start)
             for split in reversed(SPLITS)
             for scene in range(len(self.scenes))
             for start in range(0, self.count(split), self.shard_size)
         ]
+
+    def shard(self, split: str, scene: int, row: int) -> Shard:
+        """The shard that holds a scene's sample `row`."""
+        start = row - row % self.shard_size
+        return Shard(split, scene, start, min(start + self.shard_size, self.count(split)))
 
     def seeds(self, split: str, scene: int, index: int) -> np.random.SeedSequence:
         """The seeds of one sample."""
@@ -197,11 +202,12 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
     """The dataset that config files describe, and the root directory of datasets."""
     where = " + ".join(files)
-    data = read_configs(files).get("data")
+    merged = read_configs(files)
+    data = merged.get("data")
     if not isinstance(data, Mapping) or not isinstance(data.get("dataset"), Mapping):
         raise UserError(f"{where}: data.dataset: missing; add a config of configs/data")
     dataset = tuple(field.name for field in dataclasses.fields(DatasetSpec))
-    sections = (("", read_configs(files), SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
+    sections = (("", merged, SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
     for section, content, known in sections:
         for key in content:
             if key not in known:

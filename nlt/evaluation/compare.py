@@ -20,7 +20,7 @@ from nlt.data.spec import DatasetSpec, load_spec, read_configs
 from nlt.errors import UserError
 from nlt.evaluation.clock import Clock
 from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
-from nlt.evaluation.paper import order
+from nlt.evaluation.paper import order, tables
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.metrics.image_metrics import ImageMetrics
@@ -28,7 +28,6 @@ from nlt.models.module import Batch, RenderingModule
 from nlt.paths import CONFIGS, find_config
 
 _KEYS = ("table", "data", "scale", "methods", "seed")
-_TABLES = ("table1", "table2")
 _VIEWS = 6  # in samples.png
 _BATCH = 16
 _MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept for the next method
@@ -62,8 +61,8 @@ class Comparison:
             if not isinstance(content[key], str):
                 raise UserError(f"{file}: {key}: missing; name a config of configs/{key}")
         table, seed = content.get("table"), content.get("seed", 0)
-        if table is not None and table not in _TABLES:
-            raise UserError(f"{file}: table: must be one of {', '.join(_TABLES)}, is {table!r}")
+        if table is not None and table not in tables():
+            raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise UserError(f"{file}: seed: must be a whole number of at least 0, is {seed!r}")
         known = sorted((path.stem for path in (CONFIGS / "model").glob("*.yaml")), key=order)
@@ -157,7 +156,8 @@ def train(comparison: Comparison, method: str, root: Path) -> tuple[Path, dict[s
         own = run / "run.yaml"
         own.write_text(yaml.safe_dump(_run_config(run, comparison.seed)))
         arguments = ["fit", *(f"--config={file}" for file in [*files, own])]
-        if checkpoint:
+        resumed = checkpoint is not None
+        if resumed:
             print(f"resuming from {checkpoint}")
             arguments.append(f"--ckpt_path={checkpoint}")
         begin = time.time()
@@ -168,7 +168,7 @@ def train(comparison: Comparison, method: str, root: Path) -> tuple[Path, dict[s
         took["trained_at_commit"] = origin()["commit"]
         checkpoint = newest_checkpoint(run)
         assert checkpoint is not None
-        done.write_text(json.dumps(took | {"resumed": len(arguments) > 1 + len(files) + 1}))
+        done.write_text(json.dumps(took | {"resumed": resumed}))
     return checkpoint, json.loads(done.read_text())
 
 

@@ -15,6 +15,11 @@ def paper() -> dict[str, Any]:
     return yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text())
 
 
+def tables() -> tuple[str, ...]:
+    """The tables that it has published numbers of."""
+    return tuple(name for name, content in paper().items() if "title" in content)
+
+
 def label(method: str) -> str:
     """The paper's name of a method; a method it lacks goes by its own."""
     return paper()["labels"].get(method, method)

@@ -12,7 +12,7 @@ from nlt.evaluation.paper import label, paper, published
 from nlt.metrics.image_metrics import METRICS
 
 # The table's leading columns, the paper's and in its order.
-COLUMNS = ("time_per_frame_s", "mse", "mssim", "fid", "feature_l1")
+COLUMNS = tuple(paper()["columns"])
 
 
 def text(key: str, value: float | None) -> str:

@@ -46,15 +46,13 @@ class Renderer:
         Returns:
             (3, H, W) float32 for the whole image, else (3, n).
         """
+        if pixels is not None:
+            return self._trace(camera, spp, seed, pixels)
         if not is_jit():
             # A Python loop per path costs more than C++ per image unless few pixels are asked for.
-            if pixels is None:
-                return self._scalar_image(camera, spp, seed)
-            return self._trace(camera, spp, seed, pixels)
-        if pixels is None:
-            image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
-            return image.reshape(3, camera.height, camera.width)
-        return self._trace(camera, spp, seed, pixels)
+            return self._scalar_image(camera, spp, seed)
+        image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
+        return image.reshape(3, camera.height, camera.width)
 
     def _trace(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray) -> np.ndarray:
         corner = np.stack([pixels % camera.width, pixels // camera.width], 1).astype(np.float32)

@@ -69,6 +69,7 @@ class Scene:
         if not own_lights:
             meshes = {n: _without_emitter(m, self.shapes[n]) if m.is_emitter() else m for n, m in meshes.items()}
         self._assemble(meshes)
+        self._centres = {movable.name: self._centre(movable) for movable in self.movables}
         self.set_state(rest_state(description, experiment))
 
     def _check_shapes(self, known: set[str]) -> None:
@@ -159,16 +160,15 @@ class Scene:
         self.state = state
         units = self.description.units_per_metre
         for movable, translation, present in zip(self.movables, state.translation, state.present, strict=True):
+            centre = self._centres[movable.name] * units
             offset, scale = translation.astype(float) * units, 1.0 if present else _SPECK
             if movable.name == MOVING_LIGHT:
                 transform = self._light_transform(translation.astype(float))
                 self._parameters[f"emitter_{MOVING_LIGHT}.to_world"] = transform
             if movable.name in self._instances:
-                centre = self._centre(movable) * units
                 to_world = mi.ScalarTransform4f().translate(list(centre * (1 - scale) + offset)).scale(scale)
                 self._parameters[self._instances[movable.name]] = to_world
             for key, rest in self._moving_meshes[movable.name].items():
-                centre = self._centre(movable) * units
                 moved = (rest - centre) * scale + centre + offset
                 self._parameters[key] = owned(moved.astype(np.float32))
         if len(self._parameters):
