@@ -171,6 +171,19 @@ def test_metrics_are_logged(tmp_path):
     assert (image.width, image.height) == (4 * 16, 3 * 16)
 
 
+def test_image_grid_where_validation_is_rare(tmp_path):
+    """Validated at epochs 1, 3 and 5, drawn every 3 or more: at 1 and 5, none of them divisible by 3."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    batch = synthetic_batch()
+    often = {"max_epochs": 6, "check_val_every_n_epoch": 2, "num_sanity_val_steps": 0}
+    run = trainer(tmp_path, logger=TensorBoardLogger(tmp_path), callbacks=[ImageGrid(every_n_epochs=3)], **often)
+    run.fit(CNN(width=4), loader(batch), loader(batch))
+    events = EventAccumulator(run.logger.log_dir).Reload()
+    per_epoch = run.global_step // 6
+    assert [image.step for image in events.Images("val/images")] == [2 * per_epoch, 6 * per_epoch]
+
+
 def test_image_grid_without_a_logger(tmp_path):
     batch = synthetic_batch()
     del batch["noisy"]

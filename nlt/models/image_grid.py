@@ -13,7 +13,9 @@ from nlt.metrics.display import display
 
 
 class ImageGrid(L.Callback):
-    """Every `every_n_epochs` epochs adds the image "val/images": a row each for the first `images` samples.
+    """Adds the image "val/images", a row each for the first `images` samples.
+
+    Drawn at the first validation, then at the first one `every_n_epochs` or more epochs after the last drawn.
 
     Columns, as displayed: noisy (where the batch has it), prediction, reference, absolute difference of the
     last two. Does nothing without a TensorBoard logger and on ranks other than 0.
@@ -23,10 +25,12 @@ class ImageGrid(L.Callback):
         self.every_n_epochs = every_n_epochs
         self.images = images
         self._rows: list[Tensor] = []
+        self._drawn: int | None = None  # the epoch of the last
 
     def _active(self, trainer: L.Trainer) -> bool:
-        due = trainer.current_epoch % self.every_n_epochs == 0 and not trainer.sanity_checking
-        return due and trainer.is_global_zero
+        # Not epochs divisible by it: validation may never fall on one.
+        due = self._drawn is None or trainer.current_epoch - self._drawn >= self.every_n_epochs
+        return due and trainer.is_global_zero and not trainer.sanity_checking
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._rows = []
@@ -52,6 +56,7 @@ class ImageGrid(L.Callback):
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not self._active(trainer) or not self._rows:
             return
+        self._drawn = trainer.current_epoch
         grid = torch.cat(self._rows, dim=-2)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
