@@ -13,5 +13,11 @@ def scenes_root() -> Path:
 
 
 def find_config(kind: str, name: str) -> Path:
-    """A config by name (`configs/<kind>/<name>.yaml`) or by path."""
+    """A config by name (`configs/<kind>/<name>.yaml`, the name may hold folders) or by path."""
     return Path(name) if name.endswith((".yaml", ".yml")) else CONFIGS / kind / f"{name}.yaml"
+
+
+def config_names(kind: str) -> list[str]:
+    """Every name that `find_config` knows of a kind, such as "kitchen" and "real/kitchen"."""
+    folder = CONFIGS / kind
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))

@@ -9,7 +9,7 @@ import trimesh
 import yaml
 
 from nlt.rendering.variant import use_variant
-from nlt.scenes.builtin import demo_room
+from nlt.scenes.builtin import living_room
 from nlt.scenes.description import MOVING_LIGHT, load_description
 
 LIGHT = {"size": (0.6, 0.4), "radiance": (7.0, 5.0, 3.0), "height": 1.9}
@@ -23,7 +23,7 @@ def variant():
 
 @pytest.fixture(scope="session")
 def demo(variant):
-    return load_description("demo_room")
+    return load_description("living_room")
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +44,7 @@ def renderer(scene):
 def write_yaml(path, **content):
     """A scene.yaml; by default over the demo room."""
     content = {
-        "source": "builtin:demo_room",
+        "source": "builtin:living_room",
         "camera": {"min": [-1.8, 1.0, -1.7], "max": [2.2, 1.6, 1.75]},
         **content,
     }
@@ -108,7 +108,7 @@ def offsets(description, experiment, state):
 def demo_meshes(description, experiment, state):
     """The demo room in a state as {shape: (BuiltinShape, vertices)}; without the moving light."""
     moved = offsets(description, experiment, state)
-    shapes = {key: shape for key, shape in demo_room().items() if moved.get(key, 0) is not None}
+    shapes = {key: shape for key, shape in living_room().items() if moved.get(key, 0) is not None}
     return {key: (shape, shape.mesh.vertices + moved.get(key, 0)) for key, shape in shapes.items()}
 
 

@@ -38,7 +38,7 @@ SIZE = {
 
 
 def spec_of(*scenes, **more):
-    return DatasetSpec(list(scenes) or ["demo_room"], **{**SIZE, **more})
+    return DatasetSpec(list(scenes) or ["living_room"], **{**SIZE, **more})
 
 
 def content(directory):
@@ -106,12 +106,12 @@ def test_nothing_is_pickled(dataset):
 @pytest.mark.parametrize(
     "change",
     [{"resolution": 0}, {"train": 0}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
-     {"experiment": "moving"}, {"scenes": []}, {"scenes": "demo_room"}, {"reference_spp": True}],
+     {"experiment": "moving"}, {"scenes": []}, {"scenes": "living_room"}, {"reference_spp": True}],
     ids=str,
 )  # fmt: skip
 def test_spec_refused(change):
     with pytest.raises(UserError, match=f"data.dataset.{next(iter(change))}"):
-        DatasetSpec(**{"scenes": ["demo_room"], **SIZE, **change})
+        DatasetSpec(**{"scenes": ["living_room"], **SIZE, **change})
 
 
 # ---- splits ---------------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def test_killed_and_resumed(dataset, tmp_path):
     code = (
         "import sys; from pathlib import Path; from nlt.data.generate import generate\n"
         "from nlt.data.spec import DatasetSpec\n"
-        f"generate(DatasetSpec(['demo_room'], **{SIZE!r}), Path(sys.argv[1]), workers=1)\n"
+        f"generate(DatasetSpec(['living_room'], **{SIZE!r}), Path(sys.argv[1]), workers=1)\n"
     )
     child = subprocess.Popen(
         [sys.executable, "-c", code, str(tmp_path)], cwd=PROJECT, start_new_session=True, stderr=subprocess.DEVNULL
@@ -206,7 +206,7 @@ def test_killed_worker(dataset, tmp_path, monkeypatch):
 def test_worker_killed_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_worker", _always_killed)
     monkeypatch.setattr(generation, "_announce", lambda *_: None)
-    with pytest.raises(UserError, match=r"demo_room.*worker died twice"):
+    with pytest.raises(UserError, match=r"living_room.*worker died twice"):
         generate(spec_of(), tmp_path, workers=1)
 
 
@@ -259,7 +259,7 @@ def test_manifest(damaged, tmp_path):
     path.write_text(path.read_text()[:50])
     with pytest.raises(UserError, match=r"manifest.json: damaged"):
         module_of(damaged)
-    path.write_text(json.dumps({**manifest, "scenes": {"demo_room": "0"}}))
+    path.write_text(json.dumps({**manifest, "scenes": {"living_room": "0"}}))
     with pytest.raises(UserError, match=r"manifest.json: scenes"):
         module_of(damaged)
     path.unlink()
@@ -464,7 +464,7 @@ def test_projection_sees_what_the_camera_sees(demo, resolution, least, most):
 @pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}")
 @pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.79, 0.12), (128, 0.86, 0.085)])
 def test_projection_in_the_living_room(resolution, least, most):
-    description = load_description("living-room")
+    description = load_description("real/living-room")
     plain = mi.load_file(str(description.path), optimize=False)
     scene = Scene(description, "fixed_lights")
     assert {s.id() for s in plain.shapes()} == set(scene.shapes)

@@ -9,7 +9,7 @@ from scipy import stats
 
 from nlt.data.sample import POINT_FIELDS
 from nlt.scenes.assembly import Scene, Shape
-from nlt.scenes.builtin import demo_room
+from nlt.scenes.builtin import living_room
 from nlt.scenes.description import MATERIALS, MOVING_LIGHT, load_description
 from nlt.scenes.pointcloud import material, sample_points
 from nlt.scenes.state import rest_state
@@ -30,7 +30,7 @@ def points(own_lights):
 @pytest.fixture(scope="module")
 def meshes(demo):
     """Shape index -> (name, BuiltinShape), in the order of the scene."""
-    return list(demo_room().items())
+    return list(living_room().items())
 
 
 def test_fields(points):

@@ -482,7 +482,7 @@ def test_scalar_agrees(renderer, demo):
         "import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()\n"
         "from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene\n"
         "from nlt.scenes.description import load_description; from nlt.scenes.state import rest_state, sample_view\n"
-        "d = load_description('demo_room'); r = Renderer(Scene(d, 'moving_lights'))\n"
+        "d = load_description('living_room'); r = Renderer(Scene(d, 'moving_lights'))\n"
         "r.scene.set_state(rest_state(d, 'moving_lights')); c = sample_view(d, 12, np.random.default_rng(7))\n"
         "np.save(sys.stdout.buffer, np.stack([r.radiance(c, 8, s) for s in range(40)]))\n"
     )

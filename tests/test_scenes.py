@@ -58,7 +58,7 @@ def test_description_refused(tmp_path, content, fragments):
 
 
 def test_description_unreadable(tmp_path):
-    refused(lambda: load_description("no_such"), "no_such.yaml", "demo_room")
+    refused(lambda: load_description("no_such"), "no_such.yaml", "living_room")
     file = tmp_path / "scene.yaml"
     refused(lambda: load_description(str(file)), file)
     file.write_text("camera: [1\n")
@@ -76,7 +76,7 @@ def test_description_unreadable(tmp_path):
             "fixed_lights",
             ["objects.b.shapes", "rug", "belongs to a"],
         ),
-        ({"source": "builtin:palace"}, "static", ["source", "palace", "demo_room"]),
+        ({"source": "builtin:palace"}, "static", ["source", "palace", "living_room"]),
         ({}, "moving_lights", ["moving_light", "missing"]),
     ],
 )
@@ -115,7 +115,7 @@ def test_states_follow_the_supplementary(demo):
     rng = np.random.default_rng(5)
     states = [sample_state(demo, "moving_lights", rng) for _ in range(1500)]
     translation, present = np.stack([s.translation for s in states]), np.stack([s.present for s in states])
-    content = yaml.safe_load((CONFIGS / "scenes" / "demo_room.yaml").read_text())
+    content = yaml.safe_load((CONFIGS / "scenes" / "living_room.yaml").read_text())
     light = np.array(content["moving_light"]["box"], float)
     boxes = [np.array(entry["box"], float) for entry in content["objects"].values()] + [light - light.mean(0)]
 
@@ -150,7 +150,7 @@ def test_static_has_nothing_to_move(demo):
 def test_views_follow_the_supplementary(demo):
     rng = np.random.default_rng(6)
     views = [sample_view(demo, 16, rng) for _ in range(600)]
-    box = yaml.safe_load((CONFIGS / "scenes" / "demo_room.yaml").read_text())["camera"]
+    box = yaml.safe_load((CONFIGS / "scenes" / "living_room.yaml").read_text())["camera"]
     low, high = np.array(box["min"]), np.array(box["max"])
     position = np.stack([v.position for v in views])
     p = [stats.kstest(position[:, k], stats.uniform(low[k], high[k] - low[k]).cdf).pvalue for k in range(3)]

@@ -14,7 +14,7 @@ from nlt.metrics import image_metrics
 from nlt.metrics.inception import STAGES
 
 DATASET = {
-    "scenes": ["demo_room"], "experiment": "moving_lights", "resolution": 16, "train": 8, "val": 3, "test": 3,
+    "scenes": ["living_room"], "experiment": "moving_lights", "resolution": 16, "train": 8, "val": 3, "test": 3,
     "points": 64, "photons": 64, "reference_spp": 2, "shard_size": 4,
 }  # fmt: skip
 TRAINER = {

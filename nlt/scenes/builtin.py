@@ -321,7 +321,7 @@ def area_light(width: float, height: float, radiance: Vec, border: dict[str, Any
     return {"panel": panel, "frame": boxes(border, *frame(width, height, 0.05, 0.04))}
 
 
-def demo_room() -> Shapes:
+def living_room() -> Shapes:
     """A living room of 5 x 2.6 x 4 m with a window, a ceiling lamp, a mirror and a glass ball."""
     paint = diffuse(rgb(0.8, 0.8, 0.78))
     paper = diffuse(texture(stripes((0.72, 0.68, 0.56), (0.5, 0.58, 0.5))))
@@ -382,7 +382,7 @@ def demo_room() -> Shapes:
     }
 
 
-BUILTINS: dict[str, Callable[[], Shapes]] = {"demo_room": demo_room}  # scene name -> shapes by stable id
+BUILTINS: dict[str, Callable[[], Shapes]] = {"living_room": living_room}  # scene name -> shapes by stable id
 
 
 def mitsuba_scene(name: str) -> mi.Scene:

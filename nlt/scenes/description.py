@@ -18,10 +18,12 @@ import numpy as np
 import yaml
 
 from nlt.errors import UserError
-from nlt.paths import find_config, scenes_root
+from nlt.paths import config_names, find_config, scenes_root
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
+Teacher = Literal["path"]
+TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that make the images to learn from
 # Material type of a surface, by the lobes of its BSDF; the index into this tuple is what is stored.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
 MOVING_LIGHT = "moving_light"  # its name as a movable object, and its shape id
@@ -59,7 +61,11 @@ class MovingLight:
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling)."""
+    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling).
+
+    `room` (2, 3) bounds the inside of the room, None where the whole scene is meant. `teacher` is the integrator
+    with the lower variance at equal time in this scene.
+    """
 
     name: str
     file: Path
@@ -72,6 +78,8 @@ class SceneDescription:
     look_at: np.ndarray
     objects: tuple[Movable, ...]
     light: MovingLight | None
+    room: np.ndarray | None = None
+    teacher: str = "path"
 
     def movables(self, experiment: str) -> tuple[Movable, ...]:
         """What a state of this experiment moves: nothing, the objects, or the objects and the light."""
@@ -158,11 +166,14 @@ def load_description(name: str) -> SceneDescription:
     try:
         data = yaml.safe_load(file.read_text())
     except FileNotFoundError:
-        known = ", ".join(sorted(p.stem for p in find_config("scenes", "x").parent.glob("*.yaml")))
+        known = ", ".join(config_names("scenes"))
         raise UserError(f"{file}: no such scene description; known scenes are {known}") from None
     except yaml.YAMLError as error:
         raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
-    keys = ("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "objects", "moving_light")
+    keys = (
+        *("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "room", "teacher"),
+        *("objects", "moving_light"),
+    )
     top = _Section(file, "", data, keys)
     scale = 1.0 / float(top.positive("units_per_metre", default=1.0))
     up = top.get("up", "y")
@@ -175,6 +186,9 @@ def load_description(name: str) -> SceneDescription:
     camera = np.stack([view.numbers("min", (3,)), view.numbers("max", (3,))]) * scale
     if (camera[0] > camera[1]).any():
         raise UserError(f"{file}: camera: is empty: min is above max")
+    teacher = top.get("teacher", "path")
+    if teacher not in TEACHERS:
+        raise UserError(f"{file}: teacher: must be one of {', '.join(TEACHERS)}, is {teacher!r}")
     objects = []
     named = data.get("objects") or {}
     if not isinstance(named, Mapping):
@@ -207,6 +221,8 @@ def load_description(name: str) -> SceneDescription:
         look_at=camera.mean(0) + (camera - camera.mean(0)) / 2,
         objects=tuple(objects),
         light=light,
+        room=top.box("room") * scale if "room" in data else None,
+        teacher=teacher,
     )
 
 
