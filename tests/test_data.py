@@ -11,11 +11,10 @@ import time
 from collections import namedtuple
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from conftest import demo_meshes, first_hit, write_yaml
+from conftest import write_yaml
 
 from nlt.data import generate as generation
 from nlt.data import store
@@ -24,12 +23,7 @@ from nlt.data.generate import generate
 from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
-from nlt.models.projection import visible_pixels
-from nlt.paths import PROJECT, scenes_root
-from nlt.scenes.assembly import Scene
-from nlt.scenes.description import load_description
-from nlt.scenes.pointcloud import sample_points
-from nlt.scenes.state import rest_state, sample_state, sample_view
+from nlt.paths import PROJECT
 
 SIZE = {
     "resolution": 16, "train": 12, "val": 4, "test": 4, "points": 200, "photons": 200, "reference_spp": 2,
@@ -399,85 +393,3 @@ def test_two_scenes(tmp_path):
     assert batch["scene"][order].tolist() == [0, 0, 1, 1] and batch["exposure"][order].tolist() == [2, 2, 0.5, 0.5]
     assert batch["translation"].shape == (4, 1, 3) and not batch["present"][order][:2].any()
     assert module.num_scenes == 2 and "one+two" in str(module.directory)
-
-
-# ---- points against the renderer ------------------------------------------------------------------------
-
-
-def shares(description, experiment, resolution, views, free, state_of):
-    """Of the points in view: kept though free, kept though occluded; by our rule and by the nearest pixel's depth.
-
-    `free(state, origin, points)` (n,) bool says independently which points the origin sees.
-    """
-    from nlt.rendering.renderer import Renderer
-
-    scene = Scene(description, experiment)
-    renderer, points = Renderer(scene), sample_points(scene, 1500, 0)
-    counts = np.zeros(6)
-    for k in range(views):
-        state = state_of(k)
-        scene.set_state(state)
-        camera = sample_view(description, resolution, np.random.default_rng([k, 3]))
-        offset = np.append(state.translation, np.zeros((1, 3), np.float32), 0)[points["object"]]
-        present = np.append(state.present, True)[points["object"]]
-        position = points["position"] + offset
-        depth = renderer.gbuffer(camera)["depth"]
-        pixels = visible_pixels(
-            *(torch.from_numpy(a)[None] for a in (position, present, camera.matrix, camera.world_to_view, depth))
-        )[0].numpy()
-        kept = pixels < resolution**2
-        view = (camera.world_to_view[:3, :3] @ position.T).T.astype(float) + camera.world_to_view[:3, 3]
-        xy = (view @ camera.matrix.T.astype(float))[:, :2] / view[:, 2:]
-        inside = present & (view[:, 2] > 0) & (xy >= 0).all(1) & (xy < resolution).all(1)
-        assert (inside | ~kept).all()
-        column, row = np.where(inside, xy.T, 0).astype(int)
-        naive = inside & (view[:, 2] <= depth[0, row, column] * (1 + 1e-3))
-        seen = np.zeros(len(position), bool)
-        seen[inside] = free(state, camera.position, position[inside].astype(float))
-        hidden = inside & ~seen
-        counts += [seen.sum(), (seen & kept).sum(), (seen & naive).sum(),
-                   hidden.sum(), (hidden & kept).sum(), (hidden & naive).sum()]  # fmt: skip
-    seen, kept, naive, hidden, leaked, naive_leaked = counts
-    return {"kept": kept / seen, "leaked": leaked / hidden, "naive_kept": naive / seen,
-            "naive_leaked": naive_leaked / hidden, "seen": seen, "hidden": hidden}  # fmt: skip
-
-
-def by_triangles(triangles, origin, points):
-    """In float64, that nothing lies between."""
-    direction = points - origin
-    t, _, _ = first_hit(triangles, np.tile(origin, (len(points), 1)), direction)
-    return t > 1 - 1e-4
-
-
-@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.82, 0.06), (128, 0.89, 0.04)])
-def test_projection_sees_what_the_camera_sees(demo, resolution, least, most):
-    def free(state, origin, points):
-        meshes = demo_meshes(demo, "fixed_lights", state)
-        return by_triangles(np.concatenate([v[s.mesh.faces] for s, v in meshes.values()]), origin, points)
-
-    state_of = lambda k: sample_state(demo, "fixed_lights", np.random.default_rng([k, 4]))
-    result = shares(demo, "fixed_lights", resolution, 3, free, state_of)
-    assert result["seen"] > 300 and result["hidden"] > 300
-    assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]
-
-
-@pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}")
-@pytest.mark.parametrize(("resolution", "least", "most"), [(64, 0.79, 0.12), (128, 0.86, 0.085)])
-def test_projection_in_the_living_room(resolution, least, most):
-    description = load_description("real/living-room")
-    plain = mi.load_file(str(description.path), optimize=False)
-    scene = Scene(description, "fixed_lights")
-    assert {s.id() for s in plain.shapes()} == set(scene.shapes)
-    jit = mi.variant() != "scalar_rgb"
-
-    def free(state, origin, points):
-        direction = points - origin
-        if jit:
-            ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(direction.T.astype(np.float32)), 1 - 1e-3, 0, [])
-            return ~np.array(plain.ray_test(ray))
-        rays = [mi.Ray3f(origin.tolist(), d.tolist(), 1 - 1e-3, 0, []) for d in direction]
-        return ~np.array([plain.ray_test(ray) for ray in rays])
-
-    result = shares(description, "fixed_lights", resolution, 3, free, lambda k: rest_state(description, "fixed_lights"))
-    assert result["seen"] > 300 and result["hidden"] > 300
-    assert result["kept"] > least and result["leaked"] < most and result["kept"] > result["naive_kept"]

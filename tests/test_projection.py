@@ -22,7 +22,7 @@ def camera(batch):
 
 
 def scene(batch=2, points=2000, channels=5):
-    """Random points all around the camera, some not valid, and a depth map with sky."""
+    """Random points all around the camera, some not valid, and a depth map with sky, its normals random."""
     torch.manual_seed(0)
     matrix, view = camera(batch)
     depth = 1 + 3 * torch.rand(batch, 1, H, W, dtype=torch.float64)
@@ -34,21 +34,26 @@ def scene(batch=2, points=2000, channels=5):
         matrix,
         view,
         depth,
+        torch.nn.functional.normalize(torch.randn(batch, 3, H, W, dtype=torch.float64), dim=1),
     )
 
 
-def inverse_depth_at(depth, x, y):
-    """Bilinear between the four nearest pixel centres, the border repeated."""
+def occluded_share(depth, normal, matrix, view, x, y, z, epsilon):
+    """Of the four nearest pixel centres, the border repeated, by bilinear weight: whose plane lies before z."""
     i, j = math.floor(x - 0.5), math.floor(y - 0.5)
     total = 0.0
     for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1)):
         weight = (1 - abs(x - 0.5 - i - di)) * (1 - abs(y - 0.5 - j - dj))
-        d = depth[min(max(j + dj, 0), H - 1), min(max(i + di, 0), W - 1)]
-        total += weight / d if d > 0 else 0.0
+        column, row = min(max(i + di, 0), W - 1), min(max(j + dj, 0), H - 1)
+        # The rays through the centre and through (x, y), both of depth 1; where the second meets the plane.
+        centre, ray = (np.linalg.inv(matrix) @ [*at, 1] for at in ((column + 0.5, row + 0.5), (x, y)))
+        n = view[:3, :3] @ normal[:, row, column]
+        met = n @ (depth[row, column] * centre) / (n @ ray)
+        total += weight * (depth[row, column] > 0 and met > 0 and z > (1 + epsilon) * met)
     return total
 
 
-def brute_force(features, positions, valid, matrix, view, depth, epsilon=1e-3):
+def brute_force(features, positions, valid, matrix, view, depth, normal, epsilon=1e-3):
     batch, points, channels = features.shape
     total, count = np.zeros((batch, channels, H, W)), np.zeros((batch, 1, H, W))
     for b in range(batch):
@@ -59,7 +64,7 @@ def brute_force(features, positions, valid, matrix, view, depth, epsilon=1e-3):
             x, y = ((matrix[b] @ p) / p[2])[:2]
             if not (0 <= x < W and 0 <= y < H):
                 continue
-            if p[2] * inverse_depth_at(depth[b, 0], x, y) > 1 + epsilon:
+            if occluded_share(depth[b, 0], normal[b], matrix[b], view[b], x, y, p[2], epsilon) >= 0.5:
                 continue
             total[b, :, math.floor(y), math.floor(x)] += features[b, n]
             count[b, 0, math.floor(y), math.floor(x)] += 1
@@ -87,6 +92,7 @@ def test_one_point_lands_in_the_floor_of_its_projection():
         matrix,
         eye,
         torch.zeros(1, 1, H, W).double(),
+        torch.zeros(1, 3, H, W).double(),
     )
     assert result.nonzero().tolist() == [[0, 0, 2, 3]]
 
@@ -108,12 +114,12 @@ def test_permuting_the_points_changes_nothing():
 
 def test_behind_and_at_the_camera():
     """Also on the camera's plane, where x/z does not exist: dropped, and no NaN, not even in the gradient."""
-    features, _, _, matrix, _, depth = scene(batch=1, points=4)
+    features, _, _, matrix, _, depth, normal = scene(batch=1, points=4)
     view = torch.eye(4, dtype=torch.float64)[None]
     positions = torch.tensor([[[0.0, 0, -1], [0, 0, 0], [1, 1, 0], [0, 0, 1e-310]]], dtype=torch.float64)
     valid = torch.tensor([[True, True, True, False]])
     features.requires_grad_()
-    result = project(features, positions, valid, matrix, view, depth)
+    result = project(features, positions, valid, matrix, view, depth, normal)
     result.sum().backward()
     assert (result == 0).all() and (features.grad == 0).all()
 
@@ -126,6 +132,7 @@ def test_a_plane_at_a_grazing_angle(dtype):
     centre = torch.arange(size, dtype=torch.float64) + 0.5
     slope = (centre - size / 2) / focal  # y/z of the pixel rows
     depth = torch.where(slope > 0, 1 / slope, 0).view(1, 1, size, 1).expand(1, 1, size, size)
+    normal = torch.tensor([0.0, -1, 0], dtype=torch.float64).view(1, 3, 1, 1).expand(1, 3, size, size)
     # Up to the last row whose two neighbouring pixel centres both see the floor.
     z = 1 / torch.empty(5000, dtype=torch.float64).uniform_(0.5 / focal, 0.9 * slope[-1])
     x = torch.empty(5000, dtype=torch.float64).uniform_(-0.7, 0.7) * z
@@ -134,7 +141,7 @@ def test_a_plane_at_a_grazing_angle(dtype):
     valid = torch.ones(1, len(z), dtype=torch.bool)
 
     def kept(points):
-        arguments = (x.to(dtype) for x in (matrix, torch.eye(4)[None], depth))
+        arguments = (x.to(dtype) for x in (matrix, torch.eye(4)[None], depth, normal))
         return (visible_pixels(points.to(dtype), valid, *arguments) < size * size).double().mean()
 
     assert kept(positions) >= 0.999
@@ -145,9 +152,17 @@ def test_a_plane_at_a_grazing_angle(dtype):
 
 def test_nothing_is_hit():
     """Depth 0 is infinitely far: nothing is occluded."""
-    features, positions, valid, matrix, view, depth = scene()
-    everywhere = project(features, positions, valid, matrix, view, torch.zeros_like(depth))
-    far = project(features, positions, valid, matrix, view, torch.full_like(depth, 1e9))
+    features, positions, valid, matrix, view, depth, normal = scene()
+    everywhere = project(features, positions, valid, matrix, view, torch.zeros_like(depth), normal)
+    far = project(
+        features,
+        positions,
+        valid,
+        matrix,
+        view,
+        torch.full_like(depth, 1e9),
+        view[:, 2, :3, None, None].expand_as(normal),
+    )
     torch.testing.assert_close(everywhere, far)
     assert (everywhere != 0).any()
 
@@ -158,5 +173,6 @@ def test_bfloat16_features_count_beyond_256():
     result = project(
         torch.ones(1, 1000, 1, dtype=torch.bfloat16), torch.tensor([[[0.0, 0, 1]]]).expand(1, 1000, 3),
         torch.ones(1, 1000, dtype=torch.bool), torch.eye(3)[None], eye, torch.zeros(1, 1, H, W),
+        torch.zeros(1, 3, H, W),
     )  # fmt: skip
     assert result[0, 0, 0, 0] == 1

@@ -45,7 +45,7 @@ def draw_sample(path: Path, sample: Batch) -> None:
     camera = (sample["camera_matrix"], sample["world_to_view"])
     # Against a depth map of "no hit", nothing is occluded.
     in_view, kept = (
-        visible_pixels(sample["point_position"], sample["point_visible"], *camera, depth)[0]
+        visible_pixels(sample["point_position"], sample["point_visible"], *camera, depth, sample["normal"])[0]
         for depth in (torch.zeros_like(sample["depth"]), sample["depth"])
     )
     points, hits = sample["point_position"][0], sample["photon_hit"][0][valid]

@@ -22,7 +22,7 @@ Batch = dict[str, Tensor]
 
 # The names in a batch that the two shared inputs read.
 GBUFFER = ("depth", "normal", "albedo", "view_direction")
-PROJECTION = ("depth", "camera_matrix", "world_to_view")
+PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
 GBUFFER_CHANNELS = 10
 
@@ -122,7 +122,8 @@ class RenderingModule(L.LightningModule):
 
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
         """Eq. (1) with the batch's camera: features (B, N, C) at positions (B, N, 3) to (B, C, H, W)."""
-        return project(features, positions, valid, batch["camera_matrix"], batch["world_to_view"], batch["depth"])
+        camera = (batch["camera_matrix"], batch["world_to_view"])
+        return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
     def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
         """Features to linear radiance (B, 3, H, W); the U-Net itself works in exposed radiance."""

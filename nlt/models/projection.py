@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 
-def _transform(matrix: Tensor, points: Tensor) -> Tensor:
-    """Matrices (B, 3, 3) times points (B, N, 3)."""
+def _transform(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """Matrices (B, 3, 3) times vectors (B, 3, N)."""
     # Not a matmul: that may run in bfloat16 or TF32, which moves points by whole pixels.
-    return (matrix[:, None] * points[:, :, None]).sum(-1)
+    x, y, z = (matrix[:, :, k, None] * vectors[:, None, k] for k in range(3))
+    return x + y + z
 
 
 def visible_pixels(
@@ -19,37 +19,52 @@ def visible_pixels(
     camera_matrix: Tensor,
     world_to_view: Tensor,
     depth: Tensor,
+    normal: Tensor,
     epsilon: float = 1e-3,
 ) -> Tensor:
     """The pixel each point is seen in.
 
     `positions` (B, N, 3) in metres, world; `valid` (B, N) bool; `camera_matrix` (B, 3, 3) in pixels;
-    `world_to_view` (B, 4, 4); `depth` (B, 1, H, W) in metres along z, 0 where nothing was hit.
+    `world_to_view` (B, 4, 4); `depth` (B, 1, H, W) in metres along z, 0 where nothing was hit; `normal`
+    (B, 3, H, W), world.
 
     Returns (B, N) int64: row * W + column of floor(K T p), or H * W for a point that is not valid, not in
-    front of the camera, outside the image, or occluded. A point at depth z is occluded where
-    z > (1 + epsilon) D: the paper's tolerance, relative to the depth D there. D is interpolated to where
-    exactly the point falls, bilinearly in 1/D, which is linear in screen space on a plane: the nearest
-    pixel's depth would drop most points of a surface seen at a grazing angle.
+    front of the camera, outside the image, or occluded. A pixel occludes what lies behind the plane through
+    the surface at its centre: at more than 1 + epsilon times the plane's depth there, the paper's tolerance.
+    A point is occluded where at least half of the four nearest pixels, weighted bilinearly, occlude it.
+    Planes, for depths alone would drop most points of a slanted surface; a vote, for between two pixels that
+    see different surfaces no depth in between is either's.
     """
     height, width = depth.shape[-2:]
-    view = _transform(world_to_view[:, :3, :3], positions) + world_to_view[:, None, :3, 3]
-    z = view[..., 2]
-    in_front = z > 0
-    xy = _transform(camera_matrix, view)[..., :2] / torch.where(in_front, z, 1)[..., None]
-    x, y = xy.unbind(-1)
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    view = _transform(world_to_view[:, :3, :3], positions.mT) + world_to_view[:, :3, 3:]
+    homogeneous = _transform(camera_matrix, view)
+    in_front = view[:, 2] > 0
+    x, y = (homogeneous[:, :2] / torch.where(in_front, view[:, 2], 1)[:, None]).unbind(1)
+    candidate = valid & in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y = torch.where(candidate, x, 0), torch.where(candidate, y, 0)
 
-    inverse_depth = torch.where(depth > 0, 1 / depth, 0)  # no hit: infinitely far
-    size = xy.new_tensor([width, height])
-    interpolated = F.grid_sample(
-        inverse_depth, (2 * xy / size - 1)[:, None], padding_mode="border", align_corners=False
-    )[:, 0, 0]
-    occluded = z * interpolated > 1 + epsilon
+    planes = _tangent_planes(camera_matrix, world_to_view, depth, normal).mT.flatten(0, 1)
+    first = height * width * torch.arange(len(depth), device=depth.device)[:, None]
+    unoccluded = torch.zeros_like(x)
+    left, top = (x - 0.5).floor(), (y - 0.5).floor()
+    for i, j in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
+        weight = (1 - (x - 0.5 - i).abs()) * (1 - (y - 0.5 - j).abs())
+        at = first + j.long().clamp(0, height - 1) * width + i.long().clamp(0, width - 1)
+        relative_depth = (planes[at].mT * homogeneous).sum(1)
+        unoccluded += weight * (relative_depth <= 1 + epsilon)
+    return torch.where(candidate & (unoccluded > 0.5), y.long() * width + x.long(), height * width)
 
-    kept = valid & in_front & inside & ~occluded
-    column, row = torch.where(kept[..., None], xy, 0).long().unbind(-1)
-    return torch.where(kept, row * width + column, height * width)
+
+def _tangent_planes(camera_matrix: Tensor, world_to_view: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
+    """(B, 3, H*W): w of each pixel, such that w . K T p is p's depth over that of the pixel's plane on p's ray."""
+    height, width = depth.shape[-2:]
+    # The plane is n . (v - x) = 0 in view space, where v = K^-1 (K T p) and x = depth K^-1 centre.
+    to_pixels = _transform(torch.linalg.inv_ex(camera_matrix)[0].mT, world_to_view[:, :3, :3])
+    m = _transform(to_pixels, normal.flatten(2).to(depth.dtype))
+    column, row = (torch.arange(size, device=depth.device, dtype=depth.dtype) + 0.5 for size in (width, height))
+    along = m[:, 0] * column.repeat(height) + m[:, 1] * row.repeat_interleave(width) + m[:, 2]
+    depth = depth.flatten(2)
+    return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit: infinitely far
 
 
 def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
@@ -72,11 +87,12 @@ def project(
     camera_matrix: Tensor,
     world_to_view: Tensor,
     depth: Tensor,
+    normal: Tensor,
     epsilon: float = 1e-3,
 ) -> Tensor:
     """Eq. (1): features (B, N, C) of points to a feature map (B, C, H, W), differentiable in the features.
 
     The other arguments are those of `visible_pixels`.
     """
-    pixels = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, epsilon)
+    pixels = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal, epsilon)
     return average(features, pixels, *depth.shape[-2:])
