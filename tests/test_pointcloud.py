@@ -4,8 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from conftest import demo_meshes, write_room
+from conftest import demo_meshes, write_room, write_yaml
 from scipy import stats
+from scipy.spatial import Delaunay
 
 from nlt.data.sample import POINT_FIELDS
 from nlt.scenes.assembly import Scene, Shape
@@ -203,3 +204,41 @@ def test_texture_of_a_loaded_mesh(tmp_path):
     rows = 1 - (z > 0.5)
     assert mine.sum() > 60
     assert np.allclose(points["albedo"][mine], pixels[rows, (x > 0.5).astype(int)] / 255, atol=1e-5)
+
+
+def test_uniform_over_triangles_of_any_size(tmp_path):
+    """Three walls of random triangles, seen whole from between them: chi-squared per wall and over all triangles."""
+    rng = np.random.default_rng(0)
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    sheets = {name: Delaunay(np.concatenate([corners, rng.random((30, 2))])) for name in ("floor", "left", "back")}
+    # u, v in the unit square to the wall's own place and size.
+    frames = {"floor": [[2, 0, 0], [0, 0, 2]], "left": [[0, 1, 0], [0, 0, 2]], "back": [[2, 0, 0], [0, 0.5, 0]]}
+    shapes = ""
+    for name, sheet in sheets.items():
+        mesh = trimesh.Trimesh(sheet.points @ frames[name], sheet.simplices, process=False)
+        mesh.export(tmp_path / f"{name}.ply")
+        light = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>' if name == "left" else ""
+        shapes += f"""<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>
+            <bsdf type="twosided"><bsdf type="diffuse"/></bsdf>{light}</shape>"""
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{shapes}</scene>')
+    camera = {"min": [0.5, 0.4, 0.5], "max": [1.5, 1, 1.5]}
+    file = write_yaml(tmp_path / "scene.yaml", name="walls", source="scene.xml", camera=camera)
+    scene = Scene(load_description(str(file)), "fixed_lights")
+    points = sample_points(scene, COUNT, 3)
+    observed, expected = [], []
+    for k, name in enumerate(scene.shapes):
+        sheet, frame = sheets[name], np.array(frames[name], float)
+        position = points["position"][points["shape"] == k].astype(float)
+        triangle = sheet.find_simplex(position @ np.linalg.pinv(frame), tol=1e-6)
+        observed.append(np.bincount(triangle, minlength=len(sheet.simplices)))
+        a, b, c = np.moveaxis(sheet.points[sheet.simplices] @ frame, 1, 0)
+        expected.append(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    total = sum(map(np.sum, expected))
+    each, areas = np.concatenate(observed), np.concatenate(expected) * COUNT / total
+    few = areas < 5  # together, as the chi-squared test wants
+    together = lambda values: np.append(values[~few], values[few].sum()) if few.any() else values
+    assert len(areas) > 100 and areas.max() > 10 * areas.min()
+    assert stats.chisquare(together(each), together(areas)).pvalue > 1e-3
+    per_shape = [part.sum() for part in observed], [part.sum() * COUNT / total for part in expected]
+    assert stats.chisquare(*per_shape).pvalue > 1e-3
+    assert stats.chisquare(per_shape[0]).pvalue < 1e-6, "the test cannot tell walls of different sizes"

@@ -1,0 +1,138 @@
+"""Photons against Mitsuba's irradiancemeter, the G-buffer against its AOVs, `noisy` against the reference."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import plain_scene, write_room
+from scipy import stats
+
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec
+from nlt.paths import scenes_root
+from nlt.rendering.renderer import Renderer
+from nlt.scenes.assembly import Scene
+from nlt.scenes.description import load_description
+from nlt.scenes.state import sample_state, sample_view
+
+# ---- photons --------------------------------------------------------------------------------------------
+
+SKY = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32) ** 4 * 20
+# Patches: centre, half width, normal, way to another patch. The second lies beside the crate, partly in its shadow.
+WALL = ([1, 0.7, 0.1], 0.4, [-1, 0, 0], [0, -0.3, 0])
+FLOOR = ([0, 0, 0.2], 0.2, [0, 1, 0], [-0.3, 0, 0])
+
+
+def irradiancemeter(folder, patch, depth):
+    """Mitsuba's irradiance of a patch, a millimetre in front of its surface: 40 estimates (40, 3)."""
+    centre, half, normal, _ = (np.array(part, float) for part in patch)
+    place = mi.ScalarTransform4f().look_at(centre + 1e-3 * normal, centre + normal, [0, 0.1, 1]).scale(float(half))
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    meter = mi.load_dict({"type": "rectangle", "to_world": place, "meter": {"type": "irradiancemeter", "film": film}})
+    plain = mi.load_file(str(folder / "scene.xml"), optimize=False)
+    # The meter is no part of the scene and shadows nothing.
+    integrator = mi.load_dict({"type": "path", "max_depth": depth})
+    render = lambda seed: mi.render(plain, sensor=meter.sensor(), integrator=integrator, spp=2048, seed=mi.UInt32(seed))
+    return np.stack([np.array(render(seed))[0, 0] for seed in range(40)]).astype(float)
+
+
+def compatible(ours, theirs):
+    """The least p-value of Welch's test, colour by colour, times their number."""
+    return 3 * stats.ttest_ind(ours, theirs, equal_var=False).pvalue.min()
+
+
+@pytest.mark.parametrize("case", ["area light", "environment", "both"])
+def test_irradiance(tmp_path, case):
+    """What photons bring to a patch of a wall or of the floor beside the crate is its direct irradiance."""
+    file = write_room(tmp_path, is_open=case != "area light", light=case != "environment")
+    if case != "area light":
+        mi.Bitmap(SKY).write(str(tmp_path / "sky.exr"))
+        source = tmp_path / "scene.xml"
+        sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+        source.write_text(source.read_text().replace("</scene>", sky))
+    patch = WALL if case == "area light" else FLOOR
+    centre, half, normal, aside = (np.array(part, float) for part in patch)
+    renderer = Renderer(Scene(load_description(str(file)), "fixed_lights"))
+    ours, shifted = [], []
+    for seed in range(40):
+        photons = renderer.photons(4000, seed)
+        arrives = photons["photon_valid"] & (photons["photon_direction"] @ normal < 0)  # not from below the floor
+        for estimates, at in ((ours, centre), (shifted, centre + aside)):
+            off = photons["photon_hit"].astype(float) - at
+            inside = arrives & (np.abs(off) < np.where(normal, 1e-3, half)).all(1)
+            estimates.append(photons["photon_flux"][inside].sum(0, dtype=float) / (2 * half) ** 2)
+    direct = irradiancemeter(tmp_path, patch, 1)
+    assert compatible(np.array(ours), direct) > 1e-3
+    assert compatible(np.array(shifted), direct) < 1e-6, "the test cannot tell a patch from its neighbour"
+    if patch is WALL:  # with one bounce from the other walls
+        assert compatible(np.array(ours), irradiancemeter(tmp_path, patch, 2)) < 1e-6, "nor direct from indirect"
+
+
+# ---- G-buffer -------------------------------------------------------------------------------------------
+
+
+def aovs(plain, camera, units):
+    """Mitsuba's AOVs at the pixel centres: depth along the axis in metres, normal, albedo; each (..., H, W)."""
+    to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
+    to_world[:3, 3] *= units
+    sensor = mi.load_dict({
+        "type": "perspective", "fov": camera.fov, "near_clip": 1e-3, "to_world": mi.ScalarTransform4f(to_world),
+        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
+        "sampler": {"type": "stratified", "sample_count": 1, "jitter": False},
+    })  # fmt: skip
+    integrator = mi.load_dict({"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo"})
+    values = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=1)), 2, 0).astype(float)
+    position, normal, albedo = np.split(values[-9:], 3)
+    depth = np.einsum("i,ihw->hw", camera.rotation[:, 2], position / units - camera.position[:, None, None])
+    return np.where(normal.any(0), depth, 0), normal, albedo
+
+
+def check_gbuffer(renderer, plain, camera):
+    depth, normal, albedo = aovs(plain, camera, renderer.scene.description.units_per_metre)
+    buffer = renderer.gbuffer(camera)
+    # A ray that grazes an edge may fall on either side of it.
+    assert (np.abs(buffer["depth"][0] - depth) < 1e-3 * (1 + depth)).mean() > 0.995
+    assert (np.abs(buffer["normal"] - normal).max(0) < 1e-2).mean() > 0.99
+    specular = (buffer["albedo"] == 0).all(0)  # which Mitsuba gives whatever value the BSDF has there
+    assert (np.abs(buffer["albedo"] - albedo.clip(0, 1)).max(0)[~specular] < 1e-2).mean() > 0.99
+    assert specular.mean() < 0.5 and depth.std() > 0.1 and normal.std() > 0.1
+    flipped = np.abs(buffer["depth"][0, :, ::-1] - depth) < 1e-3 * (1 + depth)
+    assert flipped.mean() < 0.5, "the test cannot tell left from right"
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gbuffer_is_the_aov_integrators(demo, seed):
+    state = sample_state(demo, "fixed_lights", np.random.default_rng(seed))
+    renderer = Renderer(Scene(demo, "fixed_lights"))
+    renderer.scene.set_state(state)
+    camera = sample_view(demo, 48, np.random.default_rng(10 + seed))
+    check_gbuffer(renderer, plain_scene(demo, "fixed_lights", state), camera)
+
+
+@pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason=f"the living-room is not in {scenes_root()}")
+def test_gbuffer_of_the_living_room():
+    description = load_description("real/living-room")
+    plain = mi.load_file(str(description.path), optimize=False)
+    camera = sample_view(description, 64, np.random.default_rng(1))
+    check_gbuffer(Renderer(Scene(description, "fixed_lights")), plain, camera)
+
+
+# ---- the images of samples ------------------------------------------------------------------------------
+
+
+def test_noisy_and_input_have_the_references_expectation():
+    """Over many samples, each with its own seeds, state and view: no pixel's residual has a mean, none are related."""
+    spec = DatasetSpec(["living_room"], resolution=8, test=120, points=1, photons=1, reference_spp=16)
+    render = SampleRenderer(spec, 0)
+    samples = [render.sample("test", k) for k in range(spec.test)]
+    images = {n: np.stack([s[n] for s in samples]).astype(float) for n in ("noisy", "noisy_input", "reference_a")}
+    half = np.stack([s["reference_b"] for s in samples])
+    residuals = {name: image - half for name, image in images.items()}
+    for name, residual in residuals.items():
+        p = stats.ttest_1samp(residual, 0).pvalue
+        assert np.nanmin(p) * p.size > 1e-3, name
+    dark = stats.ttest_1samp(np.minimum(images["noisy"], half.mean((0, 2, 3))[:, None, None]) - half, 0).pvalue
+    assert np.nanmin(dark) * dark.size < 1e-4, "the test cannot tell clamped images"
+    spread = {name: np.median(np.abs(residual)) for name, residual in residuals.items()}
+    assert spread["noisy"] > 1.3 * spread["noisy_input"] > 1.3**2 * spread["reference_a"], "1, 4 and 16 spp"
+    own = images["noisy"] - images["reference_a"], images["noisy_input"] - half
+    assert abs(stats.spearmanr(*(r.ravel() for r in own)).statistic) < 5 / np.sqrt(own[0].size / 3)
