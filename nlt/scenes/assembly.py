@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlt.errors import UserError
+from nlt.scenes import importer
 from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
 from nlt.scenes.lanes import is_jit, owned
 from nlt.scenes.state import SceneState, rest_state
@@ -208,17 +209,10 @@ def _load(description: SceneDescription) -> Any:
             known = ", ".join(builtin.BUILTINS)
             raise UserError(f"{description.file}: source: no built-in scene {name!r}; known are {known}")
         return builtin.mitsuba_scene(name)
-    try:
-        # optimize=False: otherwise meshes that share a BSDF are merged and lose their ids.
-        return mi.load_file(str(description.path), optimize=False)
-    except RuntimeError as error:
-        raise UserError(f"{description.path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
+    return importer.load(description.path)
 
 
 def _read(mesh: Any, description: SceneDescription, own_lights: bool) -> Shape:
-    if not isinstance(mesh, mi.Mesh):
-        kind = type(mesh).__name__
-        raise UserError(f"{description.source}: shape {mesh.id()!r} is a {kind}; convert it to a triangle mesh")
     parameters = mi.traverse(mesh)
     uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
     return Shape(

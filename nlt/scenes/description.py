@@ -7,7 +7,6 @@ else in nlt, they are metres.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,7 @@ import yaml
 
 from nlt.errors import UserError
 from nlt.paths import config_names, find_config, scenes_root
+from nlt.scenes.sources import scene_files
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
@@ -94,18 +94,17 @@ class SceneDescription:
 
     @property
     def path(self) -> Path | None:
-        """The Mitsuba XML; None for a built-in scene."""
+        """The scene file; None for a built-in scene."""
         return None if self.source.startswith(BUILTIN) else Path(self.source)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over everything the scene is made of: `scene.yaml`, the XML and the files it names."""
+        """SHA-256 over everything the scene is made of: `scene.yaml`, the scene file and the files it names."""
         files = [self.file]
         if self.path is None:
             files.append(Path(__file__).with_name("builtin.py"))
         else:
-            named = re.findall(r'value="([^"]+\.\w+)"', self.path.read_text())
-            files += [self.path, *sorted({f for n in named if (f := self.path.parent / n).is_file()})]
+            files += scene_files(self.path)
         total = hashlib.sha256()
         for file in files:
             total.update(hashlib.sha256(file.read_bytes()).digest())

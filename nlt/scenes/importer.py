@@ -1,0 +1,156 @@
+"""Any scene file as a live Mitsuba scene of triangle meshes, one per shape, each under a stable id of its own."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from nlt.errors import UserError
+from nlt.scenes import mitsuba_xml
+from nlt.scenes.meshes import Triangles, curved, live_mesh
+
+SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A loaded file. `warnings` says what could not be kept; `camera` (4, 4) is its sensor's pose, `up` its up axis."""
+
+    path: Path
+    scene: Any
+    warnings: tuple[str, ...]
+    camera: np.ndarray | None = None
+    up: str | None = None
+
+
+def load(path: Path) -> Any:
+    """The file as a `mi.Scene` of meshes; the same file gives the same scene."""
+    return read(path).scene
+
+
+def read(path: Path) -> Imported:
+    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the variant that is set.
+
+    Raises:
+        UserError: it is none of them, files that it names are missing (all are listed), or Mitsuba refuses it.
+    """
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        what = "a folder, not a scene file" if path.is_dir() else "no such file"
+        raise UserError(f"{path}: {what}; give a file ending in {', '.join(SUFFIXES)}")
+    if suffix not in SUFFIXES:
+        raise UserError(f"{path}: {suffix or 'no suffix'}: nlt reads scene files ending in {', '.join(SUFFIXES)}")
+    imported = _read_xml(path)
+    if not imported.scene.shapes():
+        raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in imported.warnings)}")
+    return imported
+
+
+def check_missing(path: Path, missing: list[str]) -> None:
+    """One error that names every file that is not there."""
+    if missing:
+        raise UserError(f"{path}: missing: {', '.join(sorted(missing))}; put them there, paths are from {path.parent}")
+
+
+def _read_xml(path: Path) -> Imported:
+    document = mitsuba_xml.read(path)
+    check_missing(path, document.missing)
+    warnings = document.warnings
+    with tempfile.TemporaryDirectory() as folder:
+        for shape in document.root.findall("shape"):
+            if shape.get("type") in mitsuba_xml.ANALYTIC:
+                _to_mesh_file(shape, Path(folder))
+        scene = _instantiate(path, ET.tostring(document.root, encoding="unicode"), warnings)
+    camera = up = None
+    if document.sensor is not None and document.sensor.find("transform") is not None:
+        camera = _matrix(document.sensor.find("transform"))
+        axis = int(np.abs(camera[:3, 1]).argmax())
+        up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
+    said = tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
+    return Imported(path, scene, said, camera, up)
+
+
+class _Collect(mi.Appender):
+    """Mitsuba's warnings, kept instead of printed."""
+
+    def __init__(self, into: Counter[str]) -> None:
+        super().__init__()
+        self.into = into
+
+    def append(self, level: Any, text: str) -> None:
+        plugin = re.search(r'in (\w+) plugin of type "(\w+)"', text)
+        names = re.findall(r'^ +- \w+ "(\w+)"', text, re.MULTILINE)
+        for name in names if plugin is not None else ():
+            assert plugin is not None
+            self.into[f"{name} of {plugin[1]} {plugin[2]} is left out: Mitsuba 3 does not know it"] += 1
+        if not names and level >= mi.LogLevel.Warn:
+            self.into[re.sub(r"^\S+ \S+ \w+ +\[\w+(\.cpp:\d+)?\] ", "", " ".join(text.split()))] += 1
+
+    def log_progress(self, *_: Any) -> None: ...
+
+
+def _instantiate(path: Path, xml: str, warnings: Counter[str]) -> Any:
+    """Mitsuba's parser, which upgrades old names; shapes are not merged, so that they keep their ids."""
+    config = mi.parser.ParserConfig(str(mi.variant()))
+    config.merge_equivalent = config.merge_meshes = False
+    config.unused_properties = mi.LogLevel.Warn
+    logger: Any = mi.logger()  # type: ignore[operator]
+    before = [logger.appender(k) for k in range(logger.appender_count())]
+    logger.clear_appenders()
+    logger.add_appender(_Collect(warnings))
+    try:
+        state = mi.parser.parse_string(config, xml)
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        text = re.sub(
+            r"\[\w+\.cpp:\d+\] |(At|while loading) string \(line \d+, col \d+\): ", "", " ".join(str(error).split())
+        )
+        raise UserError(f"{path}: Mitsuba cannot load it: {text}") from None
+    finally:
+        logger.clear_appenders()
+        for appender in before:
+            logger.add_appender(appender)
+    return scene
+
+
+def _matrix(transform: ET.Element | None) -> np.ndarray:
+    """(4, 4) of a `<transform>`, as Mitsuba reads it."""
+    if transform is None:
+        return np.eye(4)
+    xml = ET.Element("scene", version=mitsuba_xml.OLD)
+    sensor = ET.SubElement(xml, "sensor", type="perspective")
+    sensor.append(transform)
+    state = mi.parser.parse_string(mi.parser.ParserConfig(str(mi.variant())), ET.tostring(xml, encoding="unicode"))
+    name = transform.get("name", "")
+    return np.array(state.nodes[1].props[name].matrix, float).reshape(4, 4)
+
+
+def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
+    """Turn an analytic shape into a mesh in a file; Mitsuba says where its centre, radius and ends put it."""
+    kind, file = shape.get("type", ""), str(folder / f"{shape.get('id')}.ply")
+    place = [c for c in shape if c.tag in ("transform", "point", "float")]
+    root = ET.Element("scene", version=mitsuba_xml.OLD)
+    ET.SubElement(root, "shape", type=kind).extend(place)
+    (probe,) = mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False).shapes()
+    if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices a scene's parameters would not show
+        probe.write_ply(file)
+    else:
+        matrix = np.array(mi.traverse(probe)["to_world"].matrix, float).reshape(4, 4)
+        unit = curved(kind)
+        normals = unit.normals @ np.linalg.inv(matrix[:3, :3])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        vertices = unit.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        live_mesh(kind, Triangles(vertices, unit.faces, normals, unit.uv)).write_ply(file)
+    for child in place:
+        shape.remove(child)
+    shape.set("type", "ply")
+    ET.SubElement(shape, "string", name="filename", value=file)

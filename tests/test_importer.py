@@ -1,0 +1,311 @@
+"""Scene files of every dialect become the same scene: against twins in Mitsuba 3's own words, and analytic values."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from conftest import write_yaml
+from PIL import Image
+from test_scenes import refused
+
+from nlt.scenes import importer
+from nlt.scenes.assembly import Scene
+from nlt.scenes.description import load_description
+from nlt.scenes.lanes import launch
+from nlt.scenes.pointcloud import material
+
+SENSOR = """<sensor type="perspective"><float name="fov" value="55"/><transform name="toWorld">{pose}</transform>
+    <sampler type="sobol"><integer name="sampleCount" value="$spp"/></sampler>
+    <film type="ldrfilm"><boolean name="fitHorizontal" value="true"/><string name="fileFormat" value="png"/>
+    <rfilter type="tent"/><boolean name="highQualityEdges" value="true"/></film></sensor>"""
+
+# The words of Mitsuba 0.5 and 0.6, as exporters and hand-written scenes of that time use them.
+OLD = f"""<?xml version="1.0" encoding="utf-8"?>
+<scene version="0.5.0"><default name="spp" value="64"/><default name="folder" value="textures"/>
+<integrator type="path"><integer name="maxDepth" value="65"/><boolean name="strictNormals" value="true"/></integrator>
+{SENSOR.format(pose='<lookAt origin="0, 1, 3" target="0, 1, 0" up="0, 1, 0"/>')}
+<include filename="materials.xml"/>
+<bsdf type="twosided" id="Unused"><bsdf type="diffuse"><texture name="reflectance" type="bitmap">
+    <string name="filename" value="textures/nowhere.png"/></texture></bsdf></bsdf>
+<shape type="obj"><string name="filename" value="models/Mesh001.obj"/><boolean name="faceNormals" value="true"/>
+    <transform name="toWorld"><scale value="0.5"/><translate y="0.25"/></transform><ref id="Wood"/></shape>
+<shape type="obj"><string name="filename" value="models/Quad.obj"/><transform name="toWorld">
+    <rotate x="1" angle="-90"/><scale value="2"/></transform><ref id="Floor"/></shape>
+<shape type="obj"><string name="filename" value="models/Quad.obj"/>
+    <transform name="toWorld"><matrix value="1 0 0 0 0 -1 0 2 0 0 -1 0 0 0 0 1"/></transform>
+    <ref id="Steel"/><emitter type="area"><spectrum name="radiance" value="5, 4, 3"/></emitter></shape>
+<emitter type="envmap"><transform name="toWorld"><rotate y="1" angle="90"/></transform>
+    <string name="filename" value="$folder/sky.exr"/></emitter></scene>"""
+MATERIALS = """<scene version="0.5.0">
+<bsdf type="bumpmap"><texture name="map" type="bitmap"><string name="filename" value="textures/nowhere.png"/></texture>
+<bsdf type="twosided" id="Wood"><bsdf type="roughplastic"><float name="alpha" value="0.2"/>
+    <string name="distribution" value="ggx"/><float name="intIOR" value="1.5"/><float name="extIOR" value="1"/>
+    <boolean name="nonlinear" value="true"/><texture name="diffuseReflectance" type="bitmap">
+    <string name="filename" value="textures/wood.png"/><string name="filterType" value="trilinear"/>
+    <float name="uscale" value="3"/></texture></bsdf></bsdf></bsdf>
+<bsdf type="twosided" id="Floor"><bsdf type="diffuse"><spectrum name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></bsdf>
+<bsdf type="twosided" id="Steel"><bsdf type="roughconductor"><string name="material" value="Cu"/>
+    <float name="extEta" value="1"/><float name="alpha" value="0.1"/></bsdf></bsdf></scene>"""
+TWIN = """<scene version="3.0.0">
+<shape type="obj" id="a"><string name="filename" value="models/Mesh001.obj"/><boolean name="face_normals" value="true"/>
+    <transform name="to_world"><scale value="0.5"/><translate y="0.25"/></transform>
+    <bsdf type="twosided"><bsdf type="roughplastic"><float name="alpha" value="0.2"/>
+    <string name="distribution" value="ggx"/><float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>
+    <boolean name="nonlinear" value="true"/><texture name="diffuse_reflectance" type="bitmap">
+    <string name="filename" value="textures/wood.png"/><transform name="to_uv"><scale x="3"/></transform></texture>
+    </bsdf></bsdf></shape>
+<shape type="obj" id="b"><string name="filename" value="models/Quad.obj"/>
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>
+    <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.5 0.4 0.3"/></bsdf></bsdf></shape>
+<shape type="obj" id="c"><string name="filename" value="models/Quad.obj"/><transform name="to_world">
+    <matrix value="1 0 0 0 0 -1 0 2 0 0 -1 0 0 0 0 1"/></transform>
+    <bsdf type="twosided"><bsdf type="roughconductor"><string name="material" value="Cu"/>
+    <float name="alpha" value="0.1"/></bsdf></bsdf>
+    <emitter type="area"><rgb name="radiance" value="5 4 3"/></emitter></shape>
+<emitter type="envmap"><transform name="to_world"><rotate y="1" angle="90"/></transform>
+    <string name="filename" value="textures/sky.exr"/></emitter></scene>"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of what the scenes above name: a mesh, a texture and a sky."""
+    rng = np.random.default_rng(0)
+    for name in ("models", "textures"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "materials.xml").write_text(MATERIALS)
+    mesh = trimesh.creation.box((1, 1, 1))
+    uv = mesh.vertices[:, :2] + 0.5
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv)
+    (tmp_path / "models" / "Mesh001.obj").write_text(mesh.export(file_type="obj", include_texture=False))
+    (tmp_path / "models" / "Quad.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n")
+    Image.fromarray(rng.integers(0, 255, (8, 8, 3), dtype=np.uint8)).save(tmp_path / "textures" / "wood.png")
+    mi.Bitmap(rng.uniform(0, 1, (8, 16, 3)).astype(np.float32)).write(str(tmp_path / "textures" / "sky.exr"))
+    return tmp_path
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def picture(scene, spp=4):
+    """(16, 16, 3) linear radiance from a fixed camera."""
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([1, 1.5, 3], [0, 0.5, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}},
+        }
+    )
+    integrator = mi.load_dict({"type": "path", "max_depth": 4})
+    return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=1))
+
+
+def test_old_dialect_renders_as_its_twin(folder):
+    old = importer.read(write(folder / "old.xml", OLD))
+    assert [s.id() for s in old.scene.shapes()] == ["Mesh001", "Quad", "Quad_2"]
+    assert old.warnings == ("ext_eta of roughconductor is left out: Mitsuba 3 takes air",)
+    assert old.up == "y"
+    np.testing.assert_allclose(old.camera[:3, 3], [0, 1, 3], atol=1e-6)
+    twin = write(folder / "twin.xml", TWIN)
+    np.testing.assert_array_equal(picture(old.scene), picture(mi.load_file(str(twin), optimize=False)))
+
+
+def test_newest_dialect_is_left_alone(folder):
+    path = write(folder / "twin.xml", TWIN)
+    read = importer.read(path)
+    assert read.warnings == () and [s.id() for s in read.scene.shapes()] == ["a", "b", "c"]
+    np.testing.assert_array_equal(picture(read.scene), picture(mi.load_file(str(path), optimize=False)))
+
+
+def test_every_missing_file_is_named(folder):
+    (folder / "textures" / "sky.exr").unlink()
+    (folder / "models" / "Mesh001.obj").unlink()
+    path = write(folder / "old.xml", OLD.replace("</scene>", '<include filename="more.xml"/></scene>'))
+    refused(
+        lambda: importer.load(path), path, "missing: models/Mesh001.obj, more.xml, textures/sky.exr; put them there"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fragments"),
+    [
+        ("a.xml", "<scene", ["not valid XML"]),
+        ("a.xml", "<foo/>", ["not a Mitsuba scene", "<foo>"]),
+        ("a.xml", '<scene version="3.0.0"/>', ["no shapes"]),
+        ("a.xml", '<scene version="0.5.0"><shape type="cube"><ref id="Oak"/></shape></scene>', ["Oak"]),
+        ("a.xml", '<scene version="0.5.0"><shape type="cube"><blob/></shape></scene>', ["blob"]),
+        ("a.xml", '<scene version="0.6.0"><include filename="a.xml"/></scene>', ["includes itself"]),
+        ("a.txt", "words", [".txt", ".xml, .gltf, .glb, .obj"]),
+        ("folder/", None, ["a folder"]),
+        ("nowhere.xml", None, ["no such file"]),
+    ],
+)
+def test_unreadable_files_are_refused(tmp_path, name, content, fragments):
+    path = tmp_path / name
+    if content is not None:
+        path.write_text(content)
+    elif name.endswith("/"):
+        path.mkdir()
+    refused(lambda: importer.load(path), path, *fragments)
+
+
+DIFFUSE = '<bsdf type="diffuse"/>'
+# What Mitsuba 3 no longer has: the material that stands in for it, and a word of the warning.
+LOST = [
+    ('<bsdf type="coating"><bsdf type="diffuse"/></bsdf>', "coated", "coating"),
+    ('<bsdf type="roughcoating"><bsdf type="twosided"><bsdf type="conductor"/></bsdf></bsdf>',
+     "mirror", "roughcoating"),
+    ('<bsdf type="phong"><spectrum name="diffuseReflectance" value="0.2"/></bsdf>', "coated", "phong"),
+    ('<bsdf type="ward"><float name="alphaU" value="0.2"/></bsdf>', "coated", "ward"),
+    (f'<bsdf type="mixturebsdf"><string name="weights" value="1, 2, 3"/>{3 * DIFFUSE}</bsdf>',
+     "diffuse", "mixturebsdf"),
+    ('<bsdf type="difftrans"><rgb name="transmittance" value="0.5"/></bsdf>', "coated", "difftrans"),
+    ('<bsdf type="roughdiffuse"><srgb name="reflectance" value="#808080"/></bsdf>', "diffuse", "roughdiffuse"),
+    ('<bsdf type="conductor"><string name="material" value="Unobtainium"/></bsdf>', "mirror", "Unobtainium"),
+    ('<bsdf type="diffuse"><texture type="gridtexture" name="reflectance"/></bsdf>', "diffuse", "gridtexture"),
+    ('<bsdf type="dielectric"><string name="intIOR" value="bk7"/></bsdf>', "glass", None),
+    ('<bsdf type="mask"><spectrum name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf>', "diffuse", None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("bsdf", "expected", "warning"), LOST, ids=[e[0].split('"')[1] for e in LOST])
+def test_lost_plugins_become_the_nearest(tmp_path, bsdf, expected, warning):
+    xml = f'<scene version="0.6.0"><shape type="cube"><bsdf type="twosided">{bsdf}</bsdf></shape></scene>'
+    read = importer.read(write(tmp_path / "scene.xml", xml))
+    assert material(read.scene.shapes()[0].bsdf()) == expected
+    assert (len(read.warnings) == 0) if warning is None else (warning in " ".join(read.warnings))
+
+
+def test_mixture_keeps_its_weights(tmp_path):
+    """The albedo of three mixed colours is their weighted mean."""
+    colours = "".join(
+        f'<bsdf type="diffuse"><rgb name="reflectance" value="{c}"/></bsdf>' for c in ("1 0 0", "0 1 0", "0 0 1")
+    )
+    mixed = f'<bsdf type="mixturebsdf"><string name="weights" value="0.5, 0.2, 0.3"/>{colours}</bsdf>'
+    xml = f'<scene version="0.6.0"><shape type="rectangle">{mixed}</shape><emitter type="constant"/></scene>'
+    scene = importer.load(write(tmp_path / "scene.xml", xml))
+    # Under a white sky a flat diffuse surface shows its albedo.
+    pixel = np.array(picture(scene, spp=4096))[8:10, 6:9].reshape(-1, 3).mean(0)
+    np.testing.assert_allclose(pixel, [0.5, 0.2, 0.3], atol=0.01)
+
+
+ANALYTIC = {
+    "sphere": ('<point name="center" x="1" y="2" z="3"/><float name="radius" value="0.5"/>', np.pi),
+    "disk": (
+        '<transform name="toWorld"><scale value="2"/><rotate x="1" angle="30"/><translate y="1"/></transform>',
+        4 * np.pi,
+    ),
+    "rectangle": ('<transform name="toWorld"><scale x="2"/><rotate x="1" angle="30"/></transform>', 8),
+    "cube": ('<transform name="toWorld"><rotate y="1" angle="20"/><translate y="1"/></transform>', 24),
+    "cylinder": (
+        '<point name="p0" x="1" y="0" z="0"/><point name="p1" x="1" y="2" z="0"/><float name="radius" value="0.5"/>',
+        2 * np.pi,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ANALYTIC)
+@pytest.mark.parametrize("flip", ["", '<boolean name="flipNormals" value="true"/>'])
+def test_analytic_shapes_become_meshes(tmp_path, kind, flip):
+    """Area and box as the formulas say; point, normals and texture coordinates as on Mitsuba's own shape."""
+    place, area = ANALYTIC[kind]
+    glow = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'
+    shape = f'<shape type="{kind}">{place}{flip}<bsdf type="twosided">{DIFFUSE}</bsdf>{glow}</shape>'
+    path = write(tmp_path / "scene.xml", f'<scene version="0.6.0">{shape}</scene>')
+    (mesh,) = importer.load(path).shapes()
+    (exact,) = mi.load_file(str(path), optimize=False).shapes()
+    assert isinstance(mesh, mi.Mesh) and mesh.is_emitter() and mesh.id() == kind
+    assert "vertex_positions" in mi.traverse(mesh)
+    assert np.array(mesh.surface_area()).item() == pytest.approx(area, rel=4e-3)
+    for corner in ("min", "max"):
+        np.testing.assert_allclose(
+            np.array(getattr(mesh.bbox(), corner)), np.array(getattr(exact.bbox(), corner)), atol=5e-3
+        )
+    rng = np.random.default_rng(0)
+    low, high = (np.array(getattr(exact.bbox(), c), float).ravel() for c in ("min", "max"))
+    origins, targets = rng.normal(size=(500, 3)) * 3 + (low + high) / 2, rng.uniform(low, high, (500, 3))
+    hits = []
+    for shape in (mesh, exact):
+        scene = mi.load_dict({"type": "scene", "shape": shape})
+
+        def trace(origin, direction, scene=scene):
+            found = scene.ray_intersect(mi.Ray3f(origin, direction))
+            return found.t, mi.Vector3f(found.sh_frame.n), found.uv
+
+        hits.append(launch(trace, {"origin": ("Point3f", origins), "direction": ("Vector3f", targets - origins)}))
+    (t, normal, uv), (true_t, true_normal, true_uv) = hits
+    same = np.isfinite(true_t) & np.isclose(t, true_t, atol=0.02)
+    assert same.sum() > 0.95 * np.isfinite(true_t).sum() > 100
+    assert (normal * true_normal)[same].sum(1).min() > 0.99
+    gap = np.abs(uv - true_uv)[same]
+    assert np.minimum(gap, 1 - gap).max() < 0.02
+
+
+def test_instances_become_shapes(tmp_path):
+    xml = """<scene version="0.6.0"><shape type="shapegroup" id="g"><shape type="cube"/><shape type="sphere" id="ball">
+        <transform name="toWorld"><scale value="0.5"/></transform></shape></shape>
+        <shape type="instance" id="one"><ref id="g"/><transform name="toWorld"><translate x="10"/></transform></shape>
+        <shape type="instance"><ref id="g"/><transform name="toWorld"><rotate y="1" angle="90"/>
+        <translate x="20"/></transform></shape>
+        <shape type="hair" id="fur"><string name="filename" value="fur.hair"/></shape>
+        <emitter type="directional"/></scene>"""
+    read = importer.read(write(tmp_path / "scene.xml", xml))
+    boxes = {
+        s.id(): np.array([np.array(s.bbox().min), np.array(s.bbox().max)]).reshape(2, 3) for s in read.scene.shapes()
+    }
+    assert list(boxes) == ["cube", "one_ball", "cube_2", "ball"]
+    np.testing.assert_allclose(boxes["one_ball"], [[9.5, -0.5, -0.5], [10.5, 0.5, 0.5]], atol=2e-3)
+    np.testing.assert_allclose(boxes["cube_2"], [[19, -1, -1], [21, 1, 1]], atol=1e-5)
+    assert "fur is a hair" in read.warnings[1] and "directional" in read.warnings[0]
+
+
+def test_sun_and_sky_are_one_and_stand_upright(tmp_path):
+    """Mitsuba 0.6's sky has +y up, Mitsuba 3's +z; the sun stands where it is said to in both."""
+    sun = '<emitter type="sun"><vector name="sunDirection" x="0.8" y="0.5" z="0.3"/></emitter>'
+    sky = '<emitter type="sky"><float name="turbidity" value="3"/></emitter>'
+    xml = f'<scene version="0.6.0"><shape type="cube"/>{sky}{sun}</scene>'
+    environment = importer.load(write(tmp_path / "scene.xml", xml)).environment()
+
+    def radiance(*direction):
+        interaction = mi.SurfaceInteraction3f()
+        interaction.wi = -mi.Vector3f(*(np.array(direction) / np.linalg.norm(direction)).tolist())
+        return np.array(environment.eval(interaction)).max()
+
+    assert radiance(0.8, 0.5, 0.3) > 1e3 > radiance(0, 1, 0.1) > 0.05
+    assert radiance(0, -1, 0.1) == 0
+
+
+def test_point_light_becomes_a_small_lamp(tmp_path):
+    """As bright as the point light: irradiance on the floor below is I / d^2."""
+    xml = """<scene version="0.6.0"><shape type="rectangle">
+        <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>
+        <transform name="toWorld"><scale value="0.01"/></transform></shape>
+        <emitter type="point"><point name="position" z="2"/><rgb name="intensity" value="8, 4, 2"/></emitter></scene>"""
+    scene = importer.load(write(tmp_path / "scene.xml", xml))
+    sensor = mi.load_dict(
+        {
+            "type": "perspective", "fov": 0.1,
+            "to_world": mi.ScalarTransform4f().look_at([1, 0, 2], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb"},
+        }
+    )  # fmt: skip
+    pixel = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "direct"}), spp=256)).mean((0, 1))
+    np.testing.assert_allclose(pixel, np.array([8, 4, 2]) / 4 / np.pi, rtol=0.02)
+
+
+def test_imported_scene_is_assembled(folder):
+    """A description may name an old file; its digest changes with whatever the file includes."""
+    write(folder / "old.xml", OLD)
+    file = write_yaml(
+        folder / "scene.yaml",
+        source="old.xml",
+        objects={"crate": {"shapes": ["Mesh001"], "box": [[0, 0, 0], [1, 0, 0]]}},
+    )
+    description = load_description(str(file))
+    scene = Scene(description, "fixed_lights")
+    assert set(scene.shapes) == {"Mesh001", "Quad", "Quad_2"} and scene.shapes["Quad_2"].emitter is not None
+    before = description.digest
+    assert load_description(str(file)).digest == before
+    write(folder / "materials.xml", MATERIALS.replace("0.5, 0.4, 0.3", "0.5, 0.4, 0.2"))
+    assert load_description(str(file)).digest != before
