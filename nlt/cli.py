@@ -52,7 +52,8 @@ def _run(arguments: list[str]) -> int:
         from nlt.data.generate import generate
         from nlt.data.spec import load_spec
 
-        print(generate(*load_spec(options.config), workers=options.workers))
+        slurm = dict(options.slurm)
+        print(generate(*load_spec(options.config), options.workers, options.scheduler, slurm))
     elif options.command == "show":
         from nlt.evaluation.show import show_sample
 
@@ -70,7 +71,13 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     generate = commands.add_parser("generate", help="render a dataset; resumes, and does nothing if it is complete")
     generate.add_argument("--config", action="append", required=True, help="YAML; later ones override earlier ones")
-    generate.add_argument("--workers", type=_positive, help="rendering processes (default: one per core)")
+    generate.add_argument("--workers", type=_positive, help="rendered side by side (default: as many as cores)")
+    generate.add_argument(
+        "--scheduler", default="local", help="local, slurm, or a Dask scheduler such as tcp://host:8786"
+    )
+    generate.add_argument(
+        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE", help="such as partition=gpu, time=60"
+    )
     show = commands.add_parser("show", help="draw the components of a sample")
     show.add_argument("dataset", help="directory of a dataset, as `nlt generate` prints it")
     show.add_argument("--split", choices=("val", "test"), default="test")
@@ -86,6 +93,13 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
     return parser
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not (key and equals and value):
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE, is {text!r}")
+    return key, value
 
 
 def _positive(text: str) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from generated import spec_of
 
 from nlt.rendering.variant import use_variant
 from nlt.scenes.builtin import living_room
@@ -19,6 +20,14 @@ LIGHT = {"size": (0.6, 0.4), "radiance": (7.0, 5.0, 3.0), "height": 1.9}
 def variant():
     """The variant that this machine or NLT_VARIANT chooses."""
     return use_variant()
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory, variant):
+    """The directory of a small generated dataset: `generated.spec_of()`."""
+    from nlt.data.generate import generate
+
+    return generate(spec_of(), tmp_path_factory.mktemp("data"), workers=1)
 
 
 @pytest.fixture(scope="session")

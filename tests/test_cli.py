@@ -77,6 +77,7 @@ def test_help_of_fit(capfd):
         (["generate"], ["--config", "nlt generate --help"]),
         (["generate", "--config=x.yaml", "--workers=0"], ["--workers", "at least 1"]),
         (["generate", "--config=x.yaml", "--nope"], ["--nope", "--help"]),
+        (["generate", "--config=x.yaml", "--slurm=time"], ["--slurm", "KEY=VALUE", "time"]),
         (["compare", "--config"], ["--config", "nlt compare --help"]),
         (["fit"], ["data.dataset.scenes", "model", "nlt fit --help"]),
         (["fit", "--nope=1"], ["--nope=1", "nlt fit --help"]),

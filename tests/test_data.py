@@ -1,48 +1,21 @@
 """Generated datasets: complete, of the declared form, the same bytes however often interrupted, strictly checked."""
 
-import errno
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
-from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from conftest import write_yaml
+from generated import SIZE, content, spec_of
 
-from nlt.data import generate as generation
 from nlt.data import store
 from nlt.data.datamodule import EpochSampler, LightTransportDataModule, LightTransportDataset
 from nlt.data.generate import generate
 from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
-from nlt.paths import PROJECT
-
-SIZE = {
-    "resolution": 16, "train": 12, "val": 4, "test": 4, "points": 200, "photons": 200, "reference_spp": 2,
-    "shard_size": 4,
-}  # fmt: skip
-
-
-def spec_of(*scenes, **more):
-    return DatasetSpec(list(scenes) or ["living_room"], **{**SIZE, **more})
-
-
-def content(directory):
-    """Every file's bytes."""
-    return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
-
-
-@pytest.fixture(scope="session")
-def dataset(tmp_path_factory, variant):
-    return generate(spec_of(), tmp_path_factory.mktemp("data"), workers=1)
 
 
 @pytest.fixture
@@ -69,7 +42,7 @@ def test_fields(dataset):
             for name, field in fields.items():
                 assert sample[name].shape == field.resolve(spec.sizes) and sample[name].dtype == field.dtype, name
                 assert np.isfinite(sample[name]).all(), name
-    points = store.read_points(store.points_path(dataset, 0))
+    points = store.read_points(dataset / store.points_name(0))
     for name, field in POINT_FIELDS.items():
         assert points[name].shape == field.resolve(spec.sizes) and points[name].dtype == field.dtype, name
 
@@ -134,76 +107,6 @@ def test_too_few_states_refused(tmp_path):
         spec_of(str(file), experiment="fixed_lights", train=100, val=20, test=20).states(0)
 
 
-# ---- determinism and interruption -----------------------------------------------------------------------
-
-
-def test_same_bytes_twice(dataset, tmp_path):
-    again = generate(spec_of(), tmp_path, workers=2)
-    assert content(again) == content(dataset) and again.name == dataset.name
-    before = {p: p.stat().st_mtime_ns for p in again.rglob("*")}
-    generate(spec_of(), tmp_path, workers=1)
-    assert {p: p.stat().st_mtime_ns for p in again.rglob("*")} == before, "a complete dataset is left alone"
-    assert spec_of(seed=1).directory("x") != spec_of().directory("x")
-
-
-def test_killed_and_resumed(dataset, tmp_path):
-    """kill -9 of the whole process group once a shard is there, then again: as if nothing had happened."""
-    code = (
-        "import sys; from pathlib import Path; from nlt.data.generate import generate\n"
-        "from nlt.data.spec import DatasetSpec\n"
-        f"generate(DatasetSpec(['living_room'], **{SIZE!r}), Path(sys.argv[1]), workers=1)\n"
-    )
-    child = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)], cwd=PROJECT, start_new_session=True, stderr=subprocess.DEVNULL
-    )
-    directory = spec_of().directory(tmp_path)
-    deadline = time.monotonic() + 120
-    while not list(directory.glob("*/*.safetensors")):
-        assert child.poll() is None and time.monotonic() < deadline
-        time.sleep(0.001)
-    os.killpg(child.pid, signal.SIGKILL)
-    child.wait()
-    done = {p: p.stat().st_mtime_ns for p in directory.glob("*/*.safetensors")}
-    assert 0 < len(done) < len(spec_of().shards()), "killed too late to prove anything"
-    leftover = directory / "train" / f".000-0000000.safetensors.{child.pid}.tmp"  # as a kill within a write leaves
-    leftover.parent.mkdir(exist_ok=True)
-    leftover.write_bytes(b"half")
-    generate(spec_of(), tmp_path, workers=1)
-    assert content(directory) == content(dataset)
-    assert {p: p.stat().st_mtime_ns for p in done} == done
-
-
-_worker = generation._worker
-
-
-def _killed_once(spec, directory, job, *rest):
-    """A worker that is killed after its first shard, once."""
-    marker = directory.parent / "killed"
-    if not marker.exists():
-        marker.touch()
-        _worker(spec, directory, (job[0], job[1][:1], False), *rest)
-        os.kill(os.getpid(), signal.SIGKILL)
-    _worker(spec, directory, job, *rest)
-
-
-def _always_killed(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_killed_worker(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(generation, "_worker", _killed_once)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
-    assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
-    assert (tmp_path / "killed").exists()
-
-
-def test_worker_killed_twice(tmp_path, monkeypatch):
-    monkeypatch.setattr(generation, "_worker", _always_killed)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
-    with pytest.raises(UserError, match=r"living_room.*worker died twice"):
-        generate(spec_of(), tmp_path, workers=1)
-
-
 # ---- damage ---------------------------------------------------------------------------------------------
 
 
@@ -261,30 +164,6 @@ def test_manifest(damaged, tmp_path):
         module_of(damaged)
 
 
-# ---- a full disk ----------------------------------------------------------------------------------------
-
-
-def test_full_disk_within_a_write(tmp_path, monkeypatch):
-    path = tmp_path / "shard"
-    path.write_bytes(b"before")
-
-    def full(_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(UserError, match=r"shard: no space left on disk"):
-        store.write_bytes(path, b"after")
-    assert [p.name for p in tmp_path.iterdir()] == ["shard"] and path.read_bytes() == b"before"
-
-
-def test_full_disk_at_the_start(tmp_path, monkeypatch):
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
-    with pytest.raises(UserError, match=r"no space left on disk.*GB"):
-        generate(spec_of(), tmp_path, workers=1)
-    assert not list(tmp_path.rglob("*.safetensors"))
-
-
 # ---- batches --------------------------------------------------------------------------------------------
 
 
@@ -301,7 +180,7 @@ def test_batch(dataset):
 
 
 def test_points_and_directions_of_a_batch(dataset, demo):
-    points = store.read_points(store.points_path(dataset, 0))
+    points = store.read_points(dataset / store.points_name(0))
     for sample in samples_of(dataset, "test"):
         for n in range(200):
             m = points["object"][n]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import lightning as L
 import numpy as np
@@ -11,9 +10,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from nlt.data.files import AnyPath
 from nlt.data.sample import BATCH_FIELDS
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import ShardReader, check_dataset, points_path, read_points
+from nlt.data.store import ShardReader, check_dataset, points_name, read_points
 from nlt.errors import UserError
 from nlt.scenes.camera import Camera
 
@@ -31,10 +31,10 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         inputs: fields that the method reads; None for all. The split's target fields come along.
     """
 
-    def __init__(self, directory: Path, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
+    def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
         self.directory, self.spec, self.split = directory, spec, split
         self._reader = ShardReader()
-        self._points = [read_points(points_path(directory, k)) for k in range(len(spec.scenes))]
+        self._points = [read_points(directory / points_name(k)) for k in range(len(spec.scenes))]
         stored = spec.fields(split)
         self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
         needed = set(stored) if self._wanted is None else self._wanted & set(stored)
@@ -118,7 +118,7 @@ class LightTransportDataModule(L.LightningDataModule):
 
     Args:
         dataset: what it holds; `nlt generate` makes it.
-        root: directory of datasets.
+        root: directory or fsspec URL of datasets.
         batch_size: samples per step and process (paper: 32, static scenes 128).
         workers: processes that load.
         seed: of the shuffling.
@@ -136,7 +136,7 @@ class LightTransportDataModule(L.LightningDataModule):
         if batch_size < 1:
             raise UserError(f"data.batch_size: must be at least 1, is {batch_size}")
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
-        self.directory: Path | None = None
+        self.directory: AnyPath | None = None
 
     @property
     def num_scenes(self) -> int:

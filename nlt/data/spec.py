@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from nlt.data.files import AnyPath, open_path
 from nlt.data.sample import FIELDS, SPLITS, Field
 from nlt.errors import UserError
 from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, load_description
@@ -110,12 +111,12 @@ class DatasetSpec:
             "shards": [shard.name for shard in self.shards()],
         }
 
-    def directory(self, root: str | Path) -> Path:
+    def directory(self, root: str | AnyPath) -> AnyPath:
         """Where the dataset lies: a name that says what it is, and a hash of the spec and the scenes' files."""
         content = {k: v for k, v in self.manifest.items() if k in ("format", "spec", "scenes")}
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
         names = "+".join(d.name for d in self.descriptions[:4])
-        return Path(root) / f"{self.experiment}-{names}-{self.resolution}-{digest}"
+        return open_path(root) / f"{self.experiment}-{names}-{self.resolution}-{digest}"
 
     def shards(self) -> list[Shard]:
         """Every shard of the dataset, the evaluated splits first."""
@@ -199,7 +200,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return {**base, **over, **both}
 
 
-def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
+def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
     """The dataset that config files describe, and the root directory of datasets."""
     where = " + ".join(files)
     merged = read_configs(files)
@@ -214,4 +215,4 @@ def load_spec(files: list[str]) -> tuple[DatasetSpec, Path]:
                 raise UserError(f"{where}: {section}{key}: unknown key; known are {', '.join(known)}")
     if "scenes" not in data["dataset"]:
         raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
-    return DatasetSpec(**data["dataset"]), Path(data.get("root", "datasets"))
+    return DatasetSpec(**data["dataset"]), open_path(data.get("root", "datasets"))

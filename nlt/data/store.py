@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,43 +15,23 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from nlt.data.files import AnyPath, list_files, local_copy, write_bytes
+from nlt.data.sample import POINT_FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 
 MANIFEST = "manifest.json"
-_CRC = "crc:"
+CRC = "crc:"
 _OPEN_FILES = 128
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write under a temporary name, then rename: a reader sees the whole file or none.
-
-    Raises:
-        UserError: the disk is full. Nothing that was there is harmed.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            need = len(content) / 1e6
-            raise UserError(f"{path}: no space left on disk ({need:.0f} MB needed); free some and run again") from None
-        raise
-
-
-def write_shard(path: Path, samples: list[dict[str, np.ndarray]]) -> None:
+def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
     """Stack samples field by field into one file."""
     arrays: dict[str, np.ndarray] = {}
     for name in sorted(samples[0]):
         stack = np.stack([sample[name] for sample in samples])
         arrays[name] = stack
-        arrays[_CRC + name] = np.array([zlib.crc32(row.tobytes()) for row in stack], np.uint32)
+        arrays[CRC + name] = np.array([zlib.crc32(row.tobytes()) for row in stack], np.uint32)
     write_bytes(path, save(arrays))
 
 
@@ -59,25 +39,37 @@ class ShardReader:
     """Random access to samples; keeps the files it has read open. Safe to use after a fork."""
 
     def __init__(self) -> None:
-        self._files: OrderedDict[Path, Any] = OrderedDict()
+        self._files: OrderedDict[AnyPath, Any] = OrderedDict()
         self._pid = os.getpid()
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_files": OrderedDict(), "_pid": -1}
 
-    def read(self, path: Path, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
-        """The fields of one sample of a shard.
+    def read(self, path: AnyPath, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
+        """The fields of one sample of a shard. A damaged copy of a remote file is fetched once more.
 
         Raises:
             UserError: the shard is missing, truncated, or fails its CRC.
         """
+        fields = list(fields)
+        try:
+            return self._read(path, row, fields)
+        except UserError:
+            if isinstance(path, Path):
+                raise
+        self._files.pop(path, None)
+        with suppress(FileNotFoundError):  # said by the next line
+            local_copy(path, fresh=True)
+        return self._read(path, row, fields)
+
+    def _read(self, path: AnyPath, row: int, fields: list[str]) -> dict[str, np.ndarray]:
         advice = "delete the file and run `nlt generate` again"
         try:
             file = self._open(path)
             sample = {}
             for name in fields:
                 array = file.get_slice(name)[row : row + 1][0]
-                if zlib.crc32(array.tobytes()) != file.get_slice(_CRC + name)[row : row + 1][0]:
+                if zlib.crc32(array.tobytes()) != file.get_slice(CRC + name)[row : row + 1][0]:
                     raise UserError(f"{path}: damaged shard: sample {row}, field {name} fails its CRC; {advice}")
                 sample[name] = array
             return sample
@@ -86,42 +78,44 @@ class ShardReader:
         except SafetensorError as error:
             raise UserError(f"{path}: damaged shard ({error}); {advice}") from None
 
-    def _open(self, path: Path) -> Any:
+    def _open(self, path: AnyPath) -> Any:
         if self._pid != os.getpid():
             self._files, self._pid = OrderedDict(), os.getpid()
         if path not in self._files:
-            self._files[path] = safe_open(path, framework="numpy")
+            self._files[path] = safe_open(local_copy(path), framework="numpy")
             if len(self._files) > _OPEN_FILES:
                 self._files.popitem(last=False)
         self._files.move_to_end(path)
         return self._files[path]
 
 
-def read_points(path: Path) -> dict[str, np.ndarray]:
+def read_points(path: AnyPath) -> dict[str, np.ndarray]:
     """The point cloud of a scene: all of `POINT_FIELDS`."""
-    from nlt.data.sample import POINT_FIELDS
-
     return ShardReader().read(path, 0, POINT_FIELDS)
 
 
-def points_path(directory: Path, scene: int) -> Path:
-    """Where a scene's points lie."""
-    return directory / f"points-{scene:03d}.safetensors"
+def points_name(scene: int) -> str:
+    """The file with a scene's points, relative to the dataset's directory."""
+    return f"points-{scene:03d}.safetensors"
 
 
-def write_manifest(directory: Path, spec: DatasetSpec, variant: str) -> None:
+def write_manifest(directory: AnyPath, spec: DatasetSpec, variant: str) -> None:
     """Record what the dataset is made of and what rendered it; the same two write the same bytes."""
     write_bytes(directory / MANIFEST, json.dumps(spec.manifest | {"variant": variant}, indent=1).encode())
 
 
-def missing_files(directory: Path, spec: DatasetSpec) -> list[Path]:
-    """Shards and point clouds that are not there yet."""
-    wanted = [points_path(directory, k) for k in range(len(spec.scenes))]
-    wanted += [directory / shard.name for shard in spec.shards()]
-    return [path for path in wanted if not path.exists()]
+def dataset_files(spec: DatasetSpec) -> list[str]:
+    """Point clouds and shards of a dataset, relative to its directory."""
+    return [points_name(k) for k in range(len(spec.scenes))] + [shard.name for shard in spec.shards()]
 
 
-def check_dataset(directory: Path, spec: DatasetSpec) -> Mapping[str, Any]:
+def missing_files(directory: AnyPath, spec: DatasetSpec) -> list[str]:
+    """Those of `dataset_files` that are not there yet."""
+    there = list_files(directory)
+    return [name for name in dataset_files(spec) if name not in there]
+
+
+def check_dataset(directory: AnyPath, spec: DatasetSpec) -> Mapping[str, Any]:
     """The manifest of a complete dataset.
 
     Raises:
@@ -140,5 +134,5 @@ def check_dataset(directory: Path, spec: DatasetSpec) -> Mapping[str, Any]:
             raise UserError(f"{path}: {key}: is not what the config asks for; delete {directory} and {advice}")
     missing = missing_files(directory, spec)
     if missing:
-        raise UserError(f"{directory}: incomplete, {len(missing)} files missing, such as {missing[0].name}; {advice}")
+        raise UserError(f"{directory}: incomplete, {len(missing)} files missing, such as {missing[0]}; {advice}")
     return manifest

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from nlt.data.datamodule import LightTransportDataset
+from nlt.data.files import AnyPath
 from nlt.data.generate import generate
 from nlt.data.spec import DatasetSpec, load_spec, read_configs
 from nlt.errors import UserError
@@ -188,7 +189,7 @@ def _run_config(run: Path, seed: int) -> dict[str, Any]:
 class Evaluation:
     """The test split, judged by one set of metrics; reference features are computed once for all methods."""
 
-    def __init__(self, directory: Path, spec: DatasetSpec, device: torch.device) -> None:
+    def __init__(self, directory: AnyPath, spec: DatasetSpec, device: torch.device) -> None:
         self.directory, self.spec, self.device = directory, spec, device
         self._features: dict[int, dict[str, Tensor] | None] = {}
         count = len(self)

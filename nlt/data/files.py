@@ -1,0 +1,106 @@
+"""Files of a dataset, on this machine or at any fsspec URL: written whole or not at all, read through a local cache."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import fsspec
+from upath import UPath
+
+from nlt.errors import UserError
+
+# A local path is a plain pathlib.Path, a URL a UPath, which is used alike.
+AnyPath = Path | UPath
+_HOST = platform.node().replace(".", "-")
+
+
+def open_path(place: str | AnyPath) -> AnyPath:
+    """A local path or an fsspec URL, such as s3://bucket/datasets.
+
+    Raises:
+        UserError: no installed package knows the URL's protocol.
+    """
+    if "://" not in str(place) or isinstance(place, UPath):
+        return place if isinstance(place, UPath) else Path(place)
+    try:
+        path = UPath(str(place))
+        path.fs  # noqa: B018  imports what the protocol needs
+    except (ImportError, ValueError) as error:
+        raise UserError(f"data.root: {place}: {' '.join(str(error).split())}") from None
+    return path
+
+
+def write_bytes(path: AnyPath, content: bytes) -> None:
+    """Write under a temporary name, then rename: a reader sees the whole file or none. To a URL, in one put.
+
+    Raises:
+        UserError: the disk is full. Nothing that was there is harmed.
+    """
+    if isinstance(path, UPath):
+        path.fs.makedirs(path.parent.path, exist_ok=True)
+        path.fs.pipe_file(path.path, content)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{_HOST}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            need = len(content) / 1e6
+            raise UserError(f"{path}: no space left on disk ({need:.0f} MB needed); free some and run again") from None
+        raise
+
+
+def remove_leftovers(directory: AnyPath) -> None:
+    """Delete what processes of this machine that are gone were writing; another machine's may be alive."""
+    for leftover in directory.glob("**/.*.tmp") if isinstance(directory, Path) else ():
+        *_, host, pid, _ = leftover.name.split(".")
+        if host == _HOST and not _alive(int(pid)):
+            leftover.unlink(missing_ok=True)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def list_files(directory: AnyPath) -> set[str]:
+    """Every file below a directory, relative to it: one listing, not a question per file."""
+    if isinstance(directory, UPath):
+        directory.fs.invalidate_cache()  # other machines write too
+        root = directory.path.rstrip("/") + "/"
+        return {name.removeprefix(root) for name in directory.fs.find(root)}
+    return {Path(top, name).relative_to(directory).as_posix() for top, _, names in os.walk(directory) for name in names}
+
+
+def local_copy(path: AnyPath, fresh: bool = False) -> Path:
+    """The file itself if it is local; of a URL, a copy in `NLT_CACHE` (default: ~/.cache/nlt), fetched once.
+
+    Args:
+        fresh: fetch it again.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    if not isinstance(path, UPath):
+        return path
+    key = hashlib.sha256(str(path).encode()).hexdigest()
+    copy = Path(os.environ.get("NLT_CACHE", "~/.cache/nlt")).expanduser() / key[:2] / f"{key}{path.suffix}"
+    if fresh or not copy.exists():
+        # Not path.fs: a file system that is kept does not survive a fork, as of a loader's worker.
+        write_bytes(copy, fsspec.filesystem(path.protocol, **path.storage_options).cat_file(path.path))
+    return copy

@@ -1,0 +1,362 @@
+"""Generation: the same bytes however often interrupted, wherever it runs and wherever it writes to."""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from contextlib import suppress
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+from conftest import write_room
+from generated import SIZE, content, spec_of
+from remote import RemoteFileSystem
+
+from nlt.data import engines, files, store
+from nlt.data import generate as generation
+from nlt.data.generate import generate
+from nlt.data.spec import DatasetSpec
+from nlt.errors import UserError
+from nlt.paths import PROJECT
+
+# ---- determinism and interruption -----------------------------------------------------------------------
+
+
+def test_same_bytes_twice(dataset, tmp_path):
+    again = generate(spec_of(), tmp_path, workers=2)
+    assert content(again) == content(dataset) and again.name == dataset.name
+    before = {p: p.stat().st_mtime_ns for p in again.rglob("*")}
+    generate(spec_of(), tmp_path, workers=1)
+    assert {p: p.stat().st_mtime_ns for p in again.rglob("*")} == before, "a complete dataset is left alone"
+    assert spec_of(seed=1).directory("x") != spec_of().directory("x")
+
+
+LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points": 16, "photons": 16,
+        "input_spp": 1, "reference_spp": 1, "shard_size": 64}  # fmt: skip
+# The trial of the renderer before the first job would be half of the time.
+RUN = f"""if __name__ == "__main__":
+    import sys
+    from nlt.data import generate as generation
+    from nlt.data.spec import DatasetSpec
+    generation._announce = lambda *_: None
+    generation.generate(DatasetSpec(sys.argv[2:], **{LONG!r}), sys.argv[1], workers=2)
+"""
+
+
+def start(root, scene):
+    """A generation of sixteen shards of 64 samples, in a process group of its own."""
+    command = [sys.executable, "-c", RUN, str(root), scene]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, cwd=PROJECT, start_new_session=True, stdout=quiet, stderr=quiet)
+
+
+def shards(directory):
+    """Every shard and point cloud: bytes, and what shows that it was not touched."""
+    found = {path: (path.read_bytes(), path.stat()) for path in directory.rglob("*.safetensors")}
+    return {str(p.relative_to(directory)): (data, s.st_ino, s.st_mtime_ns) for p, (data, s) in found.items()}
+
+
+def test_sixteen_shards_survive(tmp_path):
+    """kill -9 of everything at ten random moments; then two runs at a time, a flipped bit, a deleted shard."""
+    scene = str(write_room(tmp_path / "room"))
+    spec = DatasetSpec([scene], **LONG)
+    assert start(tmp_path / "undisturbed", scene).wait(120) == 0
+    expected = content(spec.directory(tmp_path / "undisturbed"))
+    assert len(expected) == 16 + 2
+
+    directory, rng = spec.directory(tmp_path / "killed"), np.random.default_rng(0)
+    moments, before = [], {}
+    for _ in range(10):
+        run, more = start(tmp_path / "killed", scene), int(rng.integers(2))
+        deadline = time.monotonic() + 60
+        while len(list(directory.rglob("*.safetensors"))) < min(len(before) + more, 15):
+            assert run.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.2 if more else 1))
+        os.killpg(run.pid, signal.SIGKILL)
+        run.wait()
+        after = shards(directory)
+        assert all(data == expected[name] for name, (data, *_) in after.items()), "half a file has its name"
+        assert before == {name: after[name] for name in before}, "a finished file was touched"
+        moments.append(len(after))
+        before = after
+    assert 3 < moments[-1] < 17 and len(set(moments)) > 3, moments
+
+    both = [start(tmp_path / "killed", scene) for _ in range(2)]
+    assert [run.wait(120) for run in both] == [0, 0]
+    assert content(directory) == expected
+    assert {name: shards(directory)[name] for name in before} == before
+
+    harmed = directory / "train/000-0000128.safetensors"
+    harmed.write_bytes(bytes(byte ^ (8 * (k == 100_000)) for k, byte in enumerate(harmed.read_bytes())))
+    with pytest.raises(UserError, match=r"000-0000128.*damaged"):
+        [store.ShardReader().read(harmed, row, spec.fields("train")) for row in range(64)]
+    harmed.unlink()
+    with pytest.raises(UserError, match=r"incomplete, 1 files missing, such as train/000-0000128"):
+        store.check_dataset(directory, spec)
+    assert start(tmp_path / "killed", scene).wait(120) == 0
+    assert content(directory) == expected
+
+
+_render = generation._render
+
+
+def _killed_once(spec, directory, variant, job, *rest):
+    """A worker that is killed after its first shard, once."""
+    marker = Path(directory).parent / "killed"
+    if not marker.exists():
+        marker.touch()
+        _render(spec, directory, variant, generation.Job(job.scene, job.shards[:1], False), *rest)
+        os.kill(os.getpid(), signal.SIGKILL)
+    _render(spec, directory, variant, job, *rest)
+
+
+def _always_killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_killed_worker(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "_render", _killed_once)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
+    assert (tmp_path / "killed").exists()
+
+
+def test_worker_killed_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "_render", _always_killed)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    with pytest.raises(UserError, match=r"living_room.*worker died twice"):
+        generate(spec_of(), tmp_path, workers=1)
+
+
+# ---- clusters -------------------------------------------------------------------------------------------
+
+
+def _kills_its_dask_worker(spec, directory, variant, job, *rest):
+    """After its first shard, once: the process that runs the job is the Dask worker's child."""
+    marker = Path(directory).parent / "killed"
+    if not marker.exists():
+        _render(spec, directory, variant, generation.Job(job.scene, job.shards[:1], False), *rest)
+        with suppress(FileExistsError), marker.open("x"):
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(0.5)
+    _render(spec, directory, variant, job, *rest)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        yield cluster
+
+
+def test_killed_dask_worker(cluster, dataset, tmp_path, monkeypatch):
+    """kill -9 of one of two workers, within a job: the run ends complete, and is the same as here."""
+    monkeypatch.setattr(generation, "_render", _kills_its_dask_worker)
+    workers = {worker.pid for worker in cluster.workers.values()}
+    assert content(generate(spec_of(), tmp_path, scheduler=cluster.scheduler_address)) == content(dataset)
+    assert (tmp_path / "killed").exists() and len(workers) == 2
+    assert workers != {worker.pid for worker in cluster.workers.values()}
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """submitit writes its logs where the command runs, and its tasks know only what is installed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+
+
+def _mistaken(*_):
+    raise UserError("scene.yaml: objects: wrong")
+
+
+@pytest.mark.parametrize("where", ["local", "dask", "slurm-local"])
+def test_mistake_far_away(where, tmp_path, monkeypatch, request, elsewhere):
+    monkeypatch.setattr(generation, "_render", _mistaken)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    scheduler = request.getfixturevalue("cluster").scheduler_address if where == "dask" else where
+    with pytest.raises(UserError, match=r"^scene.yaml: objects: wrong$"):
+        generate(spec_of(), tmp_path, workers=1, scheduler=scheduler)
+
+
+def test_slurm(dataset, tmp_path, monkeypatch, elsewhere):
+    """By submitit's own stand-in for Slurm; a task is killed, once."""
+    monkeypatch.setattr(generation, "_render", _killed_once)
+    monkeypatch.setattr("submitit.Job._results_timeout_s", 0)  # for file systems that are late
+    assert content(generate(spec_of(), tmp_path, workers=2, scheduler="slurm-local")) == content(dataset)
+    assert (tmp_path / "killed").exists()
+
+
+def test_slurm_script(tmp_path, monkeypatch, elsewhere):
+    """What a cluster would be given: an array of the jobs, with the user's options."""
+    for name in ("srun", "sbatch"):
+        (tmp_path / name).write_text("#!/bin/sh\ncat $1 > given; echo no such partition >&2; exit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    with pytest.raises(UserError, match=r"--slurm: .*slurm_nope"):
+        generate(spec_of(), tmp_path, scheduler="slurm", slurm={"nope": "1"})
+    options = {"partition": "gpu", "time": "60", "cpus_per_task": "4"}
+    with pytest.raises(UserError, match=r"--scheduler slurm: .*no such partition"):
+        generate(spec_of(), tmp_path, workers=2, scheduler="slurm", slurm=options)
+    given = (tmp_path / "given").read_text()
+    for line in ("--array=0-1%2", "--partition=gpu", "--time=60", "--cpus-per-task=4", "--job-name=nlt"):
+        assert f"#SBATCH {line}\n" in given, given
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("nowhere", None, {}), "--scheduler: must be local, slurm"),
+        (("local", 1, {"time": "1"}), "--slurm: "),
+        (("slurm-local", 1, {"time": "1"}), "--slurm: "),
+        (("slurm", 1, {}), "--scheduler slurm: .*srun"),
+        (("tcp://127.0.0.1:1", 1, {}), "tcp://127.0.0.1:1: no Dask scheduler answers"),
+    ],
+)
+def test_engine_refused(arguments, words, monkeypatch, elsewhere):
+    monkeypatch.setattr(engines, "_CONNECT", 0.2)
+    with pytest.raises(UserError, match=words):
+        engines.find_engine(*arguments)
+
+
+@pytest.mark.parametrize(("scheduler", "package"), [("slurm", "submitit"), ("tcp://a:1", "distributed")])
+def test_missing_extra(scheduler, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(UserError, match=rf"--scheduler: {package} is not installed; .*nlt\[cluster\]"):
+        engines.find_engine(scheduler, None, {})
+
+
+def test_files_that_nobody_sees(tmp_path, monkeypatch):
+    """Workers that write to a disk of their own."""
+    monkeypatch.setattr(generation, "_render", _writes_nothing)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    with pytest.raises(UserError, match=r"still without .*do all machines see this directory"):
+        generate(spec_of(), tmp_path, workers=1)
+
+
+def _writes_nothing(*_):
+    pass
+
+
+# ---- other file systems ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def remote(tmp_path, monkeypatch):
+    """The URL of a store that worker processes know as they know s3://: by the entry point of a package."""
+    package = tmp_path / "packages" / "remote-1.dist-info"
+    package.mkdir(parents=True)
+    (package / "entry_points.txt").write_text("[fsspec.specs]\nremote = remote:RemoteFileSystem\n")
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: remote\nVersion: 1\n")
+    monkeypatch.syspath_prepend(package.parent)
+    (tmp_path / "store").mkdir()
+    monkeypatch.setenv("NLT_TEST_REMOTE", str(tmp_path / "store"))
+    monkeypatch.setenv("NLT_CACHE", str(tmp_path / "cache"))
+    fsspec.register_implementation("remote", RemoteFileSystem, clobber=True)
+    return "remote://bucket/datasets"
+
+
+@pytest.mark.filterwarnings("ignore:UPath 'remote'")
+def test_remote(remote, dataset, tmp_path):
+    """Generated to a URL and read back from it: the same samples; every file fetched once, a damaged copy again."""
+    objects = tmp_path / "store"
+    directory = generate(spec_of(), remote, workers=2)
+    names = {f"bucket%datasets%{directory.name}%{name}".replace("/", "%"): name for name in content(dataset)}
+    assert {names[name]: data for name, data in content(objects).items()} == content(dataset)
+
+    calls = RemoteFileSystem.calls
+    calls.clear()
+    assert not store.missing_files(directory, spec_of())
+    assert calls["ls"] == 4 and calls["info"] <= 1, "asked about every file"
+    calls.clear()
+    for reader in (store.ShardReader(), store.ShardReader()):
+        for shard in spec_of().shards():
+            for row in range(shard.stop - shard.start):
+                ours = reader.read(directory / shard.name, row, spec_of().fields(shard.split))
+                theirs = store.ShardReader().read(dataset / shard.name, row, spec_of().fields(shard.split))
+                assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
+    assert calls["cat"] == len(spec_of().shards())
+
+    shard, fields = directory / spec_of().shards()[0].name, spec_of().fields("test")
+    copy = files.local_copy(shard)
+    whole = copy.read_bytes()
+    for harmed in (whole[:-9], whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:]):
+        copy.write_bytes(harmed)
+        reader = store.ShardReader()
+        [reader.read(shard, row, fields) for row in range(4)]
+        assert copy.read_bytes() == whole
+    assert calls["cat"] == len(spec_of().shards()) + 2
+
+    (objects / f"bucket%datasets%{directory.name}%test%000-0000000.safetensors").write_bytes(whole[:-9])
+    copy.unlink()
+    with pytest.raises(UserError, match=r"remote://.*test/000-0000000.safetensors: damaged"):
+        store.ShardReader().read(shard, 3, fields)
+    shard.unlink()
+    copy.unlink()
+    with pytest.raises(UserError, match=r"remote://.*: missing shard"):
+        store.ShardReader().read(shard, 0, fields)
+    generate(spec_of(), remote, workers=1)
+    assert {names[name]: data for name, data in content(objects).items()} == content(dataset)
+
+
+@pytest.mark.parametrize("url", ["nope://bucket/x", "nope+more://x"])
+def test_unknown_protocol(url):
+    with pytest.raises(UserError, match=rf"data.root: {url.replace('+', '.')}: .*nope"):
+        files.open_path(url)
+
+
+# ---- a full disk ----------------------------------------------------------------------------------------
+
+
+def test_full_disk_within_a_write(tmp_path, monkeypatch):
+    path = tmp_path / "shard"
+    path.write_bytes(b"before")
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match=r"shard: no space left on disk"):
+        files.write_bytes(path, b"after")
+    assert [p.name for p in tmp_path.iterdir()] == ["shard"] and path.read_bytes() == b"before"
+
+
+def _fills_the_disk(*arguments):
+    """The second file that this process writes finds no room."""
+    written, fsync = [], os.fsync
+
+    def full(file):
+        written.append(file)
+        if len(written) > 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(file)
+
+    os.fsync = full
+    _render(*arguments)
+
+
+def test_full_disk_on_the_way(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(generation, "_render", _fills_the_disk)
+        with pytest.raises(UserError, match=r"no space left on disk"):
+            generate(spec_of(), tmp_path, workers=1)
+    (directory,) = tmp_path.iterdir()
+    kept = content(directory)
+    assert len(kept) == 2 and kept.items() < content(dataset).items()
+    assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
+
+
+def test_full_disk_at_the_start(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
+    with pytest.raises(UserError, match=r"no space left on disk.*GB"):
+        generate(spec_of(), tmp_path, workers=1)
+    assert not list(tmp_path.rglob("*.safetensors"))
