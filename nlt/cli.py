@@ -61,7 +61,11 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "compare":
         from nlt.evaluation.compare import compare
 
-        compare(options.config, out=options.out, scale=options.scale, data=options.data, methods=options.methods)
+        compare(options.config, options.out, options.scale, options.data, options.methods, options.seeds)
+    elif options.command == "report":
+        from nlt.evaluation.report import draw
+
+        draw(options.directory)
     return 0
 
 
@@ -92,6 +96,9 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
+    report = commands.add_parser("report", help="draw the tables and figures of results anew, on any machine")
+    report.add_argument("directory", help="of the results, as `nlt compare` wrote them")
     return parser
 
 

@@ -3,3 +3,7 @@
 
 class UserError(Exception):
     """Bad input. The message names the file, the field and the remedy, in one line."""
+
+
+class DivergedError(UserError):
+    """A training whose loss, or a method whose prediction, is not finite."""

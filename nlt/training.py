@@ -130,7 +130,7 @@ def run_lightning(arguments: list[str]) -> NLTCLI:
     except ArgumentError as error:
         raise UserError(_with_place(str(error), given, arguments[0])) from None
     except UserError as error:  # one from a loader process comes with that process's traceback
-        raise UserError(str(error).rpartition("UserError: ")[2].strip()) from None
+        raise type(error)(str(error).rpartition("UserError: ")[2].strip()) from None
 
 
 def _check_configs(arguments: list[str]) -> dict[str, str]:

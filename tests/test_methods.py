@@ -15,12 +15,15 @@ from torch.utils.data import DataLoader
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.errors import UserError
+from nlt.evaluation.compare import untrained
 from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
 
-CONFIGS = sorted((Path(__file__).parents[1] / "configs/model").glob("*.yaml"))
+ALL = sorted((Path(__file__).parents[1] / "configs/model").glob("*.yaml"))
+CONFIGS = [path for path in ALL if untrained(path.stem) is None]
+UNTRAINED = [path.stem for path in ALL if path not in CONFIGS]
 SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 
 
@@ -268,6 +271,36 @@ def test_resuming_is_exact(tmp_path, config):
     trainer(tmp_path, max_epochs=2).fit(resumed, data, ckpt_path=tmp_path / "first.ckpt", weights_only=True)
     for a, b in zip(through.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+# --- without training ---
+
+
+@pytest.mark.parametrize("name", UNTRAINED)
+def test_untrained(name):
+    """Reads what it declares; its prediction follows the light."""
+    method, batch = untrained(name), {**synthetic_batch(), "traced": 3 * torch.rand(2, 3, 16, 16)}
+    declared = {key: batch[key] for key in (*method.inputs, "exposure", "scene", "index")}
+    expected = method(declared)
+    assert expected.shape == (2, 3, 16, 16) and expected.isfinite().all() and expected.is_contiguous()
+    assert method.stages == (("gbuffer",) if "oidn" in name else ()) + ("path_tracing",)
+    assert method.spp == int(name.rpartition("_")[2]) and method.pixel_fraction == 1
+    assert not list(method.parameters())
+    scaled = {**declared, "traced": batch["traced"] / 2, "exposure": batch["exposure"] * 2}
+    torch.testing.assert_close(method(scaled), expected / 2, rtol=1e-4, atol=1e-5)
+
+
+def test_oidn_removes_noise_and_keeps_edges_of_its_guides():
+    """A checkerboard albedo under constant light, with noise: nearer to the truth than a twentieth of the noise."""
+    generator = torch.Generator().manual_seed(0)
+    albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2)).expand(1, 3, 64, 64)
+    noise = torch.rand(1, 3, 64, 64, generator=generator) * 2
+    batch = {
+        "traced": albedo * noise, "albedo": albedo, "exposure": torch.tensor([0.5]),
+        "normal": torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 64, 64),
+    }  # fmt: skip
+    error = (untrained("oidn_1")(batch) - albedo).square().mean()
+    assert error < (batch["traced"] - albedo).square().mean() / 20
 
 
 # --- the sparse denoiser ---

@@ -11,14 +11,15 @@ import pytest
 import scipy.linalg
 import torch
 import torch.multiprocessing as mp
-from skimage.metrics import structural_similarity
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional as F
 
 from nlt.errors import UserError
 from nlt.metrics import inception as inception_module
 from nlt.metrics.display import display
-from nlt.metrics.image_metrics import FID, METRICS, PERCEPTUAL, FeatureL1, ImageMetrics, UnbiasedMSE
+from nlt.metrics.image_metrics import FID, KID, SLOW, ImageMetrics, feature_l1, flip, unbiased_mse
 from nlt.metrics.inception import STAGES, Inception, find_weights, load_inception
+from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
 
 @pytest.fixture(autouse=True)
@@ -99,7 +100,7 @@ def test_mssim_matches_skimage():
     """skimage averages only windows inside the image, torchmetrics mirrors the image by 3 pixels first."""
     batch = make_batch()
     metrics = ImageMetrics(perceptual=False)
-    metrics.update(*batch)
+    each = metrics.update(*batch)["mssim"]
     expected = []
     for pair in zip(*shown(batch), strict=True):
         f, r = (np.pad(x, ((0, 0), (3, 3), (3, 3)), mode="reflect") for x in pair)
@@ -108,7 +109,7 @@ def test_mssim_matches_skimage():
             structural_similarity(f, r, win_size=7, data_range=1.0, channel_axis=0, use_sample_covariance=False)
         )
     assert metrics.compute()["mssim"].item() == pytest.approx(np.mean(expected), abs=1e-6)
-    np.testing.assert_allclose(ImageMetrics.per_image(*batch)["mssim"], expected, atol=1e-6)
+    np.testing.assert_allclose(each, expected, atol=1e-6)
 
 
 def test_unbiased_mse_is_unbiased():
@@ -119,9 +120,7 @@ def test_unbiased_mse_is_unbiased():
     estimates, naive = [], []
     for _ in range(400):
         a, b = (clean * rng.gamma(4, 1 / 4, clean.shape) for _ in range(2))  # mean `clean`, variance clean² / 4
-        metric = UnbiasedMSE()
-        metric.update(*map(torch.from_numpy, (prediction, a, b)))
-        estimates.append(metric.compute().item())
+        estimates.append(unbiased_mse(*map(torch.from_numpy, (prediction, a, b))).item())
         naive.append(np.mean((prediction - (a + b) / 2) ** 2))
     for values, biased in ((estimates, False), (naive, True)):
         error = np.std(values) / np.sqrt(len(values))
@@ -174,11 +173,45 @@ def test_feature_l1_matches_numpy():
     generator = torch.Generator().manual_seed(0)
     shapes = {"pool": (3, 8), **{stage: (3, 4, 5 - i, 6 - i) for i, stage in enumerate(STAGES)}}
     f, r = ({k: torch.rand(s, generator=generator) for k, s in shapes.items()} for _ in range(2))
-    metric = FeatureL1()
-    metric.update(f, r)
-    for key, value in metric.compute().items():
+    for key, values in feature_l1(f, r).items():
         layer = key.removeprefix("feature_l1_") if key != "feature_l1" else "pool"
-        assert value.item() == pytest.approx(np.mean(np.abs(f[layer].numpy() - r[layer].numpy())), rel=1e-6)
+        expected = np.abs(f[layer].numpy() - r[layer].numpy()).reshape(3, -1).mean(1)
+        np.testing.assert_allclose(values, expected, rtol=1e-6)
+
+
+def test_kid_is_the_unbiased_mmd():
+    """Against the definition: a cubic kernel, the means over pairs of different samples."""
+    generator = torch.Generator().manual_seed(0)
+    real, fake = torch.rand(9, 2048, generator=generator), 1.2 * torch.rand(9, 2048, generator=generator)
+    metric = KID()
+    for features, is_real in ((real, True), (fake, False)):
+        for part in features.split(4):
+            metric.update(part, real=is_real)
+    x, y = real.double().numpy(), fake.double().numpy()
+    kernel = lambda a, b: (a @ b.T / 2048 + 1) ** 3
+    off = ~np.eye(9, dtype=bool)
+    expected = kernel(x, x)[off].mean() + kernel(y, y)[off].mean() - 2 * kernel(x, y).mean()
+    assert metric.compute().item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_flip():
+    """Of equal images none, of black against white all, and not a number where an image is not."""
+    f, r = (torch.from_numpy(x) for x in shown(make_batch(3)))
+    black, white = torch.zeros(1, 3, 24, 24), torch.ones(1, 3, 24, 24)
+    assert flip(r, r).eq(0).all()
+    assert flip(black, white).item() == pytest.approx(flip(white, black).item()) == pytest.approx(1, abs=0.05)
+    values = flip(f, r)
+    assert ((values > 0) & (values < 1)).all()
+    f[1, 0, 0, 0] = torch.nan
+    assert flip(f, r).isnan().tolist() == [False, True, False]
+    assert flip(f, r)[2] == values[2]
+
+
+def test_psnr_matches_skimage():
+    batch = make_batch()
+    each = ImageMetrics(perceptual=False).update(*batch)["psnr"]
+    expected = [peak_signal_noise_ratio(r, f, data_range=1) for f, r in zip(*shown(batch), strict=True)]
+    np.testing.assert_allclose(each, expected, rtol=1e-6)
 
 
 def nvidia_resize(images: torch.Tensor) -> torch.Tensor:
@@ -300,10 +333,10 @@ def test_perceptual_metrics_end_to_end():
         metrics.update(*(x[1:] for x in batch))
         values = metrics.compute()
     assert list(values) == list(METRICS)
-    assert [k for k, v in first.items() if v.isnan()] == ["fid"]
+    assert [k for k, v in first.items() if v.isnan()] == ["fid", "kid"]
 
     f, r = (network(torch.from_numpy(x).float()) for x in shown(batch))
-    for key in PERCEPTUAL[1:]:
+    for key in ("feature_l1", *(f"feature_l1_{stage}" for stage in STAGES)):
         layer = key.removeprefix("feature_l1_") if key != "feature_l1" else "pool"
         assert values[key].item() == pytest.approx((f[layer] - r[layer]).abs().mean().item(), rel=1e-4)
     # Tr (C1 C2)^(1/2) is the nuclear norm of X1 X2ᵀ, of the centred features.
@@ -322,19 +355,20 @@ def test_updates_accumulate_and_reset():
     parts.update(*(x[:1] for x in batch))
     parts.update(*(x[1:] for x in batch))
     expected = whole.compute()
-    assert set(expected) == set(METRICS) - set(PERCEPTUAL)
+    assert set(expected) == set(METRICS) - set(SLOW)
     for key, value in parts.compute().items():
         assert value.item() == pytest.approx(expected[key].item(), rel=1e-9), key
 
 
 def test_per_image_averages_to_the_whole():
     batch = make_batch()
-    metrics = ImageMetrics(perceptual=False)
-    metrics.update(*batch)
+    metrics = ImageMetrics(perceptual=True)
+    each = metrics.update(*batch)
     values = metrics.compute()
-    for key, each in ImageMetrics.per_image(*batch).items():
-        assert each.shape == (4,)
-        assert each.mean().item() == pytest.approx(values[key].item(), rel=1e-6), key
+    assert set(each) == {key for key, metric in METRICS.items() if metric.per_image} | {"pool"}
+    for key in set(each) - {"pool"}:
+        assert each[key].shape == (4,)
+        assert each[key].mean().item() == pytest.approx(values[key].item(), rel=1e-6), key
 
 
 def test_metrics_add_nothing_to_a_checkpoint():

@@ -16,7 +16,7 @@ from nlt.cli import main
 from nlt.data.datamodule import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import write_shard
-from nlt.metrics.image_metrics import METRICS
+from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.training import run_lightning
 

@@ -1,35 +1,53 @@
-"""`nlt compare`: generate, train, evaluate and time all methods; write the table, the pictures, the manifest."""
+"""`nlt compare`: generate, train, evaluate and time all methods; write the results, from which the rest is drawn."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import pydoc
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from nlt import training
 from nlt.data.datamodule import LightTransportDataset
-from nlt.data.files import AnyPath
+from nlt.data.files import write_bytes
 from nlt.data.generate import generate
-from nlt.data.spec import DatasetSpec, load_spec, read_configs
-from nlt.errors import UserError
+from nlt.data.spec import load_spec, read_configs
+from nlt.errors import DivergedError, UserError
 from nlt.evaluation.clock import Clock
-from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
+from nlt.evaluation.frames import Frames
 from nlt.evaluation.paper import order, tables
 from nlt.evaluation.provenance import origin, surroundings
+from nlt.evaluation.report import draw
+from nlt.evaluation.results import (
+    DIVERGED,
+    FAILED,
+    OK,
+    RUNS,
+    VIEWS,
+    load,
+    write_images,
+    write_manifest,
+    write_rows,
+)
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.metrics.image_metrics import ImageMetrics
-from nlt.models.module import Batch, RenderingModule
+from nlt.metrics.jackknife import fid_and_kid_without
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
 from nlt.paths import CONFIGS, find_config
+from nlt.training import newest_checkpoint
 
 _KEYS = ("table", "data", "scale", "methods", "seed")
-_VIEWS = 6  # in samples.png
+_SHOWN = 32  # test views whose images are kept
 _BATCH = 16
 _MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept for the next method
 
@@ -43,10 +61,12 @@ class Comparison:
     scale: Path
     table: str | None = None
     methods: list[str] = field(default_factory=list)
-    seed: int = 0
+    seeds: list[int] = field(default_factory=lambda: [0])
 
     @classmethod
-    def load(cls, config: str, scale: str | None, data: str | None, methods: list[str] | None) -> Comparison:
+    def load(
+        cls, config: str, scale: str | None, data: str | None, methods: list[str] | None, seeds: int = 1
+    ) -> Comparison:
         """Read a config by name or path; the other arguments override it.
 
         Raises:
@@ -77,8 +97,12 @@ class Comparison:
             scale=find_config("scale", content["scale"]),
             table=table,
             methods=sorted(wanted, key=order),
-            seed=seed,
+            seeds=list(range(seed, seed + seeds)),
         )
+
+    def jobs(self) -> list[tuple[str, int]]:
+        """The rows to make: a method and a seed each; what is not trained has one seed."""
+        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if untrained(m) else self.seeds)]
 
     def configs(self, method: str) -> list[str]:
         """The config files of a method's training, in order."""
@@ -91,86 +115,147 @@ def compare(
     scale: str | None = None,
     data: str | None = None,
     methods: list[str] | None = None,
+    seeds: int = 1,
 ) -> Path:
     """Everything that a table needs, of which what is there already is kept. Returns its directory."""
     start, begun = time.time(), origin()
-    comparison = Comparison.load(config, scale, data, methods)
+    comparison = Comparison.load(config, scale, data, methods, seeds)
     directory = Path(out or Path("results") / comparison.name)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
         raise UserError(f"{comparison.scale}: data.dataset.test: is 0; a comparison needs test samples")
     dataset = generate(spec, root)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    test = Evaluation(dataset, spec, device)
-    clock = Clock(LightTransportDataset(dataset, spec, "test"), device)
-    rows: list[dict[str, Any]] = []
-    predictions: dict[str, Tensor] = {}
-    trained: dict[str, Any] = {}
-    for number, method in enumerate(comparison.methods, 1):
-        print(f"\n[{number}/{len(comparison.methods)}] {method}", flush=True)
-        checkpoint, trained[method] = train(comparison, method, Path("runs") / dataset.name)
-        module = RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval()
-        metrics, predictions[method] = test.evaluate(module)
-        times = clock.time(module)
-        parameters = sum(p.numel() for p in module.parameters())
-        more = {"n_test": len(test), "seed": comparison.seed, "parameters": parameters, **trained[method]}
-        rows.append({"method": method, **times, **metrics, **more, "pixel_fraction": module.pixel_fraction})
-        if number == 1:
-            print(live_header())
-        print(live_row(rows[-1]), flush=True)
-        write_tables(directory, rows, comparison.table)
-    print("\n" + "\n".join([live_header(), *(live_row(row) for row in rows)]))
-    draw_samples(directory / "samples.png", test.views(), predictions)
-    draw_speed_accuracy(directory / "speed_accuracy.png", rows)
+    frames = Frames(LightTransportDataset(dataset, spec, "test"))
+    test, clock = Evaluation(frames, device), Clock(frames, device)
+    test.write_references(directory)
     record = {
         **begun,
-        "wall_time_s": round(time.time() - start, 1),
         **surroundings(device),
         "comparison": comparison.name,
-        "seed": comparison.seed,
+        "table": comparison.table,
+        "methods": comparison.methods,
+        "seeds": comparison.seeds,
         "dataset": dataset.name,
+        "scenes": [description.name for description in spec.descriptions],
         "n_test": len(test),
+        "shown": test.shown,
         "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
-        "training": trained,
     }
-    (directory / "manifest.json").write_text(json.dumps(record, indent=1, default=str) + "\n")
-    print(f"\nwritten to {directory}: table.md, table.csv, samples.png, speed_accuracy.png, manifest.json")
+    runs: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    jobs = comparison.jobs()
+    for number, (method, seed) in enumerate(jobs, 1):
+        print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
+        run: dict[str, Any] = {"method": method, "seed": seed, "status": OK, "message": ""}
+        try:
+            module, took = obtain(comparison, method, seed, Path("runs") / dataset.name, device)
+            metrics, each, radiance = test.evaluate(module)
+            run |= clock.time(module) | metrics | clock.size(module) | took
+            run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
+            run["spp"] = (module.spp or spec.input_spp) if "path_tracing" in module.stages else 0
+            views += [{"method": method, "seed": seed, **row} for row in each]
+            if seed == comparison.seeds[0]:
+                write_images(directory, method, radiance=radiance)
+        except DivergedError as error:
+            run |= {"status": DIVERGED, "message": str(error)}
+        except (UserError, OSError):
+            raise
+        except Exception as error:  # whatever it is, the other rows go on
+            run |= {"status": FAILED, "message": " ".join(f"{type(error).__name__}: {error}".split())}
+        runs.append(run)
+        if number == 1:
+            print(live_header())
+        print(live_row(run), flush=True)
+        write_rows(directory / RUNS, runs)
+        write_rows(directory / VIEWS, views)
+        write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
+        write_tables(load(directory))
+    print("\n" + "\n".join([live_header(), *(live_row(run) for run in runs)]))
+    draw(directory)
+    print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     return directory
 
 
-def train(comparison: Comparison, method: str, root: Path) -> tuple[Path, dict[str, Any]]:
+def untrained(method: str) -> Method | None:
+    """The method, if its class is one that needs no training; None for one that does."""
+    file = CONFIGS / "model" / f"{method}.yaml"
+    model = read_configs([str(file)]).get("model", {})
+    kind = pydoc.locate(str(model.get("class_path")))
+    if not (isinstance(kind, type) and issubclass(kind, Method)) or issubclass(kind, RenderingModule):
+        return None  # what it is that is no class at all, training will say
+    try:
+        return kind(**model.get("init_args", {}))
+    except TypeError as error:
+        raise UserError(f"{file}: model.init_args: {error}") from None
+
+
+def obtain(
+    comparison: Comparison, method: str, seed: int, root: Path, device: torch.device
+) -> tuple[Method, dict[str, Any]]:
+    """The method, trained if it needs to be, and what that took.
+
+    Raises:
+        DivergedError: its training diverged, now or when it was tried before.
+    """
+    if module := untrained(method):
+        return module, {}
+    checkpoint, took = train(comparison, method, seed, root)
+    return RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval(), took
+
+
+def train(comparison: Comparison, method: str, seed: int, root: Path) -> tuple[Path, dict[str, Any]]:
     """The checkpoint of a finished training and what it took; trains, or goes on training, if need be.
 
     A run belongs to a hash of all that decides its outcome, so a method is trained anew only when that changed.
+    A training that dies is gone on with once; one that diverged is not tried again.
     """
-    from nlt.training import newest_checkpoint, run_lightning
-
     files = comparison.configs(method)
     merged = read_configs(files)
-    decides = {key: merged.get(key) for key in ("data", "model", "trainer")} | {"seed": comparison.seed}
+    decides = {key: merged.get(key) for key in ("data", "model", "trainer")} | {"seed": seed}
     key = hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
     run = root / f"{method}-{key}"
     done = run / "done.json"
+    if not (done.exists() and ("diverged" in done.read_text() or newest_checkpoint(run))):
+        try:
+            try:
+                took = _fit(run, files, seed)
+            except (UserError, OSError):
+                raise
+            except Exception as error:
+                print(f"died of {type(error).__name__}: {error}; once more", flush=True)
+                took = _fit(run, files, seed)
+        except DivergedError as error:
+            took = {"diverged": str(error)}
+        write_bytes(done, json.dumps(took).encode())
+    took = json.loads(done.read_text())
+    if "diverged" in took:
+        raise DivergedError(took["diverged"])
     checkpoint = newest_checkpoint(run)
-    if not (done.exists() and checkpoint):
-        run.mkdir(parents=True, exist_ok=True)
-        own = run / "run.yaml"
-        own.write_text(yaml.safe_dump(_run_config(run, comparison.seed)))
-        arguments = ["fit", *(f"--config={file}" for file in [*files, own])]
-        resumed = checkpoint is not None
-        if resumed:
-            print(f"resuming from {checkpoint}")
-            arguments.append(f"--ckpt_path={checkpoint}")
-        begin = time.time()
-        cli = run_lightning(arguments)
-        batch = cli.datamodule.batch_size * cli.trainer.world_size
-        steps = cli.trainer.global_step
-        took = {"train_s": time.time() - begin, "steps": steps, "images_seen": steps * batch}
-        took["trained_at_commit"] = origin()["commit"]
-        checkpoint = newest_checkpoint(run)
-        assert checkpoint is not None
-        done.write_text(json.dumps(took | {"resumed": resumed}))
-    return checkpoint, json.loads(done.read_text())
+    assert checkpoint is not None
+    return checkpoint, took
+
+
+def _fit(run: Path, files: list[str], seed: int) -> dict[str, Any]:
+    """Train in the directory `run`, from its newest checkpoint if it has one; what that took."""
+    run.mkdir(parents=True, exist_ok=True)
+    own = run / "run.yaml"
+    own.write_text(yaml.safe_dump(_run_config(run, seed)))
+    arguments = ["fit", *(f"--config={file}" for file in [*files, own])]
+    checkpoint = newest_checkpoint(run)
+    if checkpoint:
+        print(f"resuming from {checkpoint}")
+        arguments.append(f"--ckpt_path={checkpoint}")
+    begin = time.time()
+    cli = training.run_lightning(arguments)
+    steps = cli.trainer.global_step
+    return {
+        "train_s": time.time() - begin,
+        "steps": steps,
+        "images_seen": steps * cli.datamodule.batch_size * cli.trainer.world_size,
+        "trained_at_commit": origin()["commit"],
+        "resumed": checkpoint is not None,
+    }
 
 
 def _run_config(run: Path, seed: int) -> dict[str, Any]:
@@ -189,39 +274,64 @@ def _run_config(run: Path, seed: int) -> dict[str, Any]:
 class Evaluation:
     """The test split, judged by one set of metrics; reference features are computed once for all methods."""
 
-    def __init__(self, directory: AnyPath, spec: DatasetSpec, device: torch.device) -> None:
-        self.directory, self.spec, self.device = directory, spec, device
+    def __init__(self, frames: Frames, device: torch.device) -> None:
+        self.frames, self.device = frames, device
+        self.directory, self.spec = frames.dataset.directory, frames.dataset.spec
         self._features: dict[int, dict[str, Tensor] | None] = {}
-        count = len(self)
-        step = max(1, count // _VIEWS)
-        self._shown = list(range(0, count, step))[:_VIEWS]
+        self.shown = list(range(0, len(self), max(1, len(self) // _SHOWN)))[:_SHOWN]
 
     def __len__(self) -> int:
         return self.spec.test * len(self.spec.scenes)
 
-    def views(self) -> Batch:
-        """The samples that are shown, with all targets."""
-        dataset = LightTransportDataset(self.directory, self.spec, "test", ())
-        return torch.utils.data.default_collate([dataset[k] for k in self._shown])
+    def write_references(self, directory: Path) -> None:
+        """images/reference.npz, noisy.npz and gbuffer.npz of the shown views."""
+        samples = [self.frames.dataset[k] for k in self.shown]
+        stack = {name: np.stack([sample[name].numpy() for sample in samples]) for name in samples[0]}
+        reference = (stack["reference_a"] + stack["reference_b"]) / 2
+        view = np.array(self.shown)
+        write_images(directory, "reference", radiance=reference, exposure=stack["exposure"], view=view)
+        write_images(directory, "noisy", radiance=stack["noisy"])
+        write_images(directory, "gbuffer", **{name: stack[name] for name in ("albedo", "normal", "depth")})
 
     @torch.inference_mode()
-    def evaluate(self, module: RenderingModule) -> tuple[dict[str, float], Tensor]:
-        """All metrics of a method, and its predictions of the views that are shown."""
+    def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
+        """All metrics of a method; those of each view; its radiance (V, 3, H, W) of the views that are shown.
+
+        Raises:
+            DivergedError: a prediction is not finite.
+        """
+        method = method.to(self.device).eval()
         metrics = ImageMetrics(perceptual=True).to(self.device)
-        dataset = LightTransportDataset(self.directory, self.spec, "test", module.inputs)
-        shown = []
+        dataset = LightTransportDataset(self.directory, self.spec, "test", method.inputs)
+        shown, rows = [], []
+        pools: list[tuple[Tensor, Tensor]] = []
         for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH)):
+            indices = cpu_batch["index"].tolist()
+            if "traced" in method.inputs and method.spp:
+                cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            prediction = module(batch)
+            prediction = method(batch)
+            if not prediction.isfinite().all():
+                raise DivergedError(f"a prediction is not finite, among test samples {indices}")
             reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
-            metrics.update(prediction, *reference, of_reference=self._of_reference(k, reference))
-            chosen = [i for i, index in enumerate(cpu_batch["index"].tolist()) if index in self._shown]
-            shown.append(prediction[chosen].cpu())
-        return {name: float(value) for name, value in metrics.compute().items()}, torch.cat(shown)
+            of_reference = self._of_reference(k, reference)
+            each = metrics.update(prediction, *reference, of_reference=of_reference)
+            if of_reference and "pool" in each:
+                pools.append((each.pop("pool"), of_reference["pool"]))
+            columns = {name: values.tolist() for name, values in each.items()}
+            rows += [{"view": index, **{n: c[i] for n, c in columns.items()}} for i, index in enumerate(indices)]
+            shown.append(prediction[[i for i, index in enumerate(indices) if index in self.shown]].cpu())
+        if pools:
+            without = fid_and_kid_without(*(torch.cat(part) for part in zip(*pools, strict=True)))
+            for key, column in without.items():
+                for row, value in zip(rows, column.tolist(), strict=True):
+                    row[key] = value
+        values = {name: float(value) for name, value in metrics.compute().items()}
+        return values, rows, torch.cat(shown).numpy()
 
     def _of_reference(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
         if len(self) > _MAX_CACHED:
-            return None
+            return ImageMetrics.reference_features(*reference)
         if k not in self._features:
             self._features[k] = ImageMetrics.reference_features(*reference)
         return self._features[k]

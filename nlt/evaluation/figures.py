@@ -1,41 +1,66 @@
-"""The comparison's pictures."""
+"""The comparison's pictures, from results on disk; and that of a sample of a dataset."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 import torch
 from torch import Tensor
 
 from nlt.evaluation.paper import label
+from nlt.evaluation.results import Results
 from nlt.evaluation.tables import heading
 from nlt.metrics.display import display
-from nlt.models.module import Batch
+from nlt.metrics.quantities import METRICS
+from nlt.models.method import Batch
 from nlt.models.projection import average, visible_pixels
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+matplotlib.rcParams["svg.hashsalt"] = "nlt"  # the same drawing gives the same bytes
+
 _INCH = 1.1  # of an image in samples.png
-_PANELS = ("mssim", "fid", "feature_l1", "mse")
+_ROWS = 6  # views in samples.png
+# The supplementary's six panels, and two.
+_PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
+# Okabe and Ito's colours, which the colour-blind tell apart; markers and dashes for print without colour.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+_MARKERS, _DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 
 
-def draw_samples(path: Path, views: Batch, predictions: dict[str, Tensor]) -> None:
-    """One row per test view: noisy, every method, reference; all by the one display transform."""
-    columns = {"Noisy (1 spp)": views["noisy"], **{label(name): image for name, image in predictions.items()}}
-    columns["Reference"] = (views["reference_a"] + views["reference_b"]) / 2
-    count = len(views["noisy"])
-    figure, axes = plt.subplots(count, len(columns), figsize=(_INCH * len(columns), _INCH * count), squeeze=False)
+def draw_samples(results: Results) -> None:
+    """samples.png: a row per view; teaching input, every method, reference; all by the one display transform."""
+    reference, noisy = results.images("reference"), results.images("noisy")
+    if reference is None or noisy is None:
+        return  # images stay on the machine that made them
+    columns = {"Teaching input": noisy["radiance"]}
+    for method in results.methods:
+        found = results.images(method)
+        if found is not None and results.runs_of(method):
+            columns[label(method)] = found["radiance"]
+    columns["Reference"] = reference["radiance"]
+    rows = np.unique(np.linspace(0, len(noisy["radiance"]) - 1, _ROWS).round().astype(int))
+    size = (_INCH * len(columns), _INCH * len(rows))
+    figure, axes = plt.subplots(len(rows), len(columns), figsize=size, squeeze=False)
     for column, (name, images) in enumerate(columns.items()):
-        for row, image in enumerate(display(images.float(), views["exposure"])):
-            axes[row][column].imshow(image.permute(1, 2, 0).numpy(), interpolation="nearest")
+        for row, view in enumerate(rows):
+            axes[row][column].imshow(shown(images[view], reference["exposure"][view]), interpolation="nearest")
             axes[row][column].set_axis_off()
         axes[0][column].set_title(name.replace(" (", "\n("), fontsize=7)
-    figure.subplots_adjust(0.002, 0.002, 0.998, 1 - 0.35 / (_INCH * count), 0.02, 0.02)
-    figure.savefig(path, dpi=150)
+    figure.subplots_adjust(0.002, 0.002, 0.998, 1 - 0.35 / size[1], 0.02, 0.02)
+    figure.savefig(results.directory / "samples.png", dpi=150)
     plt.close(figure)
+
+
+def shown(radiance: np.ndarray, exposure: float) -> np.ndarray:
+    """Linear radiance (3, H, W) as displayed: (H, W, 3) sRGB in [0, 1]."""
+    return display(torch.from_numpy(radiance[None].astype(np.float32)), float(exposure))[0].permute(1, 2, 0).numpy()
 
 
 def draw_sample(path: Path, sample: Batch) -> None:
@@ -95,29 +120,94 @@ def _scatter(pixels: Tensor, colours: Tensor, height: int, width: int) -> Tensor
     return average(colours[None], pixels[None], height, width)[0].permute(1, 2, 0)
 
 
-def draw_speed_accuracy(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Accuracy over time per frame, a panel per metric; methods that trace pixels are one curve."""
-    figure, axes = plt.subplots(1, len(_PANELS), figsize=(4 * len(_PANELS), 3.6))
-    traced = sorted((row for row in rows if row["pixel_fraction"] > 0), key=lambda row: row["pixel_fraction"])
-    others = [row for row in rows if row["pixel_fraction"] == 0]
-    markers = "osD^vP*X"
-    for axis, key in zip(axes, _PANELS, strict=True):
-        milliseconds = [1e3 * row["time_per_frame_s"] for row in traced]
-        axis.plot(milliseconds, [row[key] for row in traced], "x-", color="0.4", label="Denoising (pixels traced)")
-        for x, row in zip(milliseconds, traced, strict=True):
-            axis.annotate(f"1/{round(1 / row['pixel_fraction'])}", (x, row[key]), (3, 4), textcoords="offset points",
-                          fontsize=8, color="0.3")  # fmt: skip
-        for k, row in enumerate(others):
-            axis.plot(1e3 * row["time_per_frame_s"], row[key], markers[k % len(markers)], ms=8,
-                      label=label(row["method"]))  # fmt: skip
+def draw_speed_accuracy(results: Results) -> None:
+    """speed_accuracy.png and .svg: accuracy over time per frame, a panel per metric.
+
+    Methods of one class that path trace are a curve, labelled by their pixels or samples per pixel. Bars are the
+    standard deviation over seeds, with one seed the 95% interval over test views. The grey line is the Pareto front.
+    """
+    panels = [key for key in _PANELS if any(math.isfinite(results.mean(m, key)) for m in results.methods)]
+    if not panels:
+        return
+    columns = math.ceil(len(panels) / 2)
+    figure, axes = plt.subplots(2, columns, figsize=(3.3 * columns, 6.4), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    curves = _curves(results)
+    in_curves = {method for members in curves.values() for method in members}
+    points = [method for method in results.methods if method not in in_curves]
+    for axis, key in zip(axes.flat, panels, strict=False):
+        at = {m: (1e3 * results.mean(m, "time_per_frame_s"), results.mean(m, key)) for m in results.methods}
+        at = {m: place for m, place in at.items() if all(map(math.isfinite, place))}
+        front = _pareto_front(at, METRICS[key].direction)
+        axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
+        for k, (name, members) in enumerate(curves.items()):
+            found = [m for m in members if m in at]
+            style = {"color": ("0.35", "0.55", "0.1")[k % 3], "ls": _DASHES[k % 4], "marker": "x+."[k % 3]}
+            _plot(axis, results, key, found, at, name, style)
+            for m in found:
+                part = label(m).partition("(")[2].rstrip(")")
+                axis.annotate(part, at[m], (3, 4), textcoords="offset points", fontsize=7, color=style["color"])
+        for k, m in enumerate(m for m in points if m in at):
+            style = {"color": _COLOURS[k % len(_COLOURS)], "ls": "", "marker": _MARKERS[k % len(_MARKERS)]}
+            _plot(axis, results, key, [m], at, label(m), style)
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        axis.xaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        axis.tick_params(axis="x", which="both", labelsize=7)
-        axis.set_xlabel("time per frame (ms)")
-        axis.set_title(heading(key))
+        axis.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
+        axis.set_xlabel("time per frame (ms)", fontsize=8)
+        axis.set_title(heading(key), fontsize=9)
+        axis.tick_params(labelsize=8)
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0.04 + 0.03 * math.ceil(len(labels) / 5), 1, 1))
+    for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+        figure.savefig(results.directory / f"speed_accuracy.{kind}", dpi=150, metadata=metadata)
     plt.close(figure)
+
+
+def _plot(
+    axis: plt.Axes,
+    results: Results,
+    key: str,
+    methods: list[str],
+    at: Mapping[str, tuple[float, float]],
+    name: str,
+    style: Mapping[str, Any],
+) -> None:
+    """Points with their error bars, joined by the style's line."""
+    if not methods:
+        return
+    x, y = np.array([at[m] for m in methods]).T
+    bars = np.array([_bar(results, m, key, value) for m, value in zip(methods, y, strict=True)]).T
+    axis.errorbar(x, y, yerr=bars, ms=6, lw=1.2, elinewidth=0.9, capsize=2, label=name, **style)
+
+
+def _bar(results: Results, method: str, key: str, mean: float) -> tuple[float, float]:
+    std, (low, high) = results.std(method, key), results.interval(method, key)
+    if math.isfinite(std):
+        return std, std
+    return (max(mean - low, 0), max(high - mean, 0)) if math.isfinite(low) else (0, 0)
+
+
+def _curves(results: Results) -> dict[str, list[str]]:
+    """Classes with several methods that path trace: the methods, by what they are called, the cheapest first."""
+    families: dict[str, dict[str, float]] = {}
+    for run in results.runs:
+        if run.get("spp") and run["status"] == "ok":
+            families.setdefault(run["family"], {})[run["method"]] = run["spp"] * run["pixel_fraction"]
+    return {
+        label(next(iter(members))).partition(" (")[0]: sorted(members, key=members.__getitem__)
+        for members in families.values()
+        if len(members) > 1
+    }
+
+
+def _pareto_front(at: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:
+    """The (time, value) places that no other place is better than in both, by time."""
+    sign = 1 if direction == "lower" else -1
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(at.values(), key=lambda place: (place[0], sign * place[1])):
+        if not front or sign * y < sign * front[-1][1]:
+            front.append((x, y))
+    return front

@@ -1,35 +1,160 @@
-"""The comparison's table: as CSV, as Markdown with the paper's figures beside ours, and live in the terminal."""
+"""The comparison's tables, from results on disk: as CSV, Markdown and LaTeX, and live in the terminal."""
 
 from __future__ import annotations
 
-import csv
 import math
-from pathlib import Path
+import re
+from dataclasses import dataclass
 from typing import Any
 
-from nlt.evaluation.clock import STAGES
+from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label, paper, published
-from nlt.metrics.image_metrics import METRICS
+from nlt.evaluation.results import OK, Results, write_rows
+from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
-# The table's leading columns, the paper's and in its order.
+# The first table's columns, the paper's and in its order; then what the paper lacks.
 COLUMNS = tuple(paper()["columns"])
+_FEATURE_LAYERS = tuple(key for key in METRICS if key.startswith("feature_l1_"))
+_MORE = ("unbiased_mse", "psnr", "flip", "kid", *_FEATURE_LAYERS)
+_SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
+_NONE = "–"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text, a row per method; the first column is its name."""
+
+    title: str
+    note: str
+    columns: list[str]
+    rows: list[list[str]]
 
 
 def text(key: str, value: float | None) -> str:
-    """A number as it is printed; empty where there is none."""
-    if value is None or math.isnan(value):
-        return ""
-    if key.endswith("_s"):
-        return f"{value:.4f}"
-    return format(value, METRICS[key].format)
+    """A number as it is printed, in its quantity's unit."""
+    if value is None or not math.isfinite(value):
+        return _NONE
+    quantity = QUANTITIES[key]
+    return format(value * quantity.scale, quantity.format)
 
 
 def heading(key: str) -> str:
-    """A column's heading, with the direction in which it is better."""
-    if key == "time_per_frame_s":
-        return "time / frame (s)"
-    arrow = {"lower": "↓", "higher": "↑"}[METRICS[key].direction]
-    return f"{METRICS[key].label} {arrow}"
+    """A column's heading: name, unit, and for a metric the direction in which it is better."""
+    quantity = QUANTITIES[key]
+    unit = f" ({quantity.unit})" if quantity.unit != "1" else ""
+    arrow = {"lower": " ↓", "higher": " ↑"}[quantity.direction] if key in METRICS else ""
+    return f"{quantity.label}{unit}{arrow}"
+
+
+def tables(results: Results) -> list[Table]:
+    """Every table of a comparison: the paper's columns, other metrics, sizes, stages, intervals."""
+    table = results.manifest["table"]
+    seeds = len(results.manifest["seeds"])
+    note = f"N = {results.manifest['n_test']} test views; " + (
+        f"mean ± standard deviation over {seeds} seeds of training." if seeds > 1 else "one seed."
+    )
+    if table:
+        note += (
+            f" After the slash the paper's figures (its {table.replace('table', 'Table ')}: 256x256 pixels, 100,000 "
+            "training images per scene, four scenes, 300,000 iterations, a GPU). Another scale and other scenes: "
+            "compare the order of the methods, not the numbers."
+        )
+    stages = tuple(f"{stage}_s" for stage in STAGES if any(_measured(results, f"{stage}_s")))
+    bounds = [key for key in ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1") if _measured(results, key)]
+    return [
+        _table(results, paper()[table]["title"] if table else "Comparison", note, COLUMNS, table),
+        _table(results, "Further metrics", "", _MORE),
+        _table(results, "Sizes", "FLOPs and memory are the network's, the renderer's not included.", _SIZES),
+        _table(results, "Time per stage", "Medians.", (*stages, "time_per_frame_p95_s")),
+        Table(
+            "95% bootstrap intervals over test views",
+            "",
+            [heading(key) for key in bounds],
+            [
+                [_name(results, m), *(" to ".join(text(k, v) for v in results.interval(m, k)) for k in bounds)]
+                for m in results.methods
+            ],
+        ),
+    ]
+
+
+def _measured(results: Results, key: str) -> list[str]:
+    return [method for method in results.methods if len(results.values(method, key))]
+
+
+def _table(results: Results, title: str, note: str, keys: tuple[str, ...], table: str | None = None) -> Table:
+    rows = []
+    for method in results.methods:
+        theirs = published(table, method)
+        cells = [_cell(results, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key in keys]
+        rows.append([_name(results, method), *cells])
+    return Table(title, note, [heading(key) for key in keys], rows)
+
+
+def _name(results: Results, method: str) -> str:
+    status = results.status(method)
+    return label(method) + (f" [{status}]" if status != OK else "")
+
+
+def _cell(results: Results, method: str, key: str) -> str:
+    std = results.std(method, key)
+    return text(key, results.mean(method, key)) + (f" ± {text(key, std)}" if math.isfinite(std) else "")
+
+
+def write_tables(results: Results) -> None:
+    """table.csv with every number unrounded, table.md and table.tex."""
+    found = tables(results)
+    write_rows(results.directory / "table.csv", [_summary(results, method) for method in results.methods])
+    write_bytes(results.directory / "table.md", _markdown(found).encode())
+    write_bytes(results.directory / "table.tex", _latex(found).encode())
+
+
+def _summary(results: Results, method: str) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "method": method,
+        "status": results.status(method),
+        "n_test": results.manifest["n_test"],
+        "seeds": len(results.runs_of(method)),
+    }
+    for key in (*COLUMNS, *(key for key in QUANTITIES if key not in COLUMNS)):
+        if _measured(results, key):
+            row |= {key: results.mean(method, key), f"{key}_std": results.std(method, key)}
+            if QUANTITIES[key].per_image:
+                row |= dict(zip((f"{key}_low", f"{key}_high"), results.interval(method, key), strict=True))
+    return row
+
+
+def _markdown(found: list[Table]) -> str:
+    lines = []
+    for number, table in enumerate(found, 1):
+        lines += [f"{'#' * min(number, 2)} {table.title}", ""]
+        if table.note:
+            lines += [table.note, ""]
+        lines += [f"| method | {' | '.join(table.columns)} |", "|---|" + "---:|" * len(table.columns)]
+        lines += [f"| {' | '.join(row)} |" for row in table.rows]
+        lines.append("")
+    return "\n".join([*lines, "Where the numbers come from: manifest.json, runs.csv, views.csv."]) + "\n"
+
+
+_LATEX = {
+    **{c: f"\\{c}" for c in "&%$#_{}"}, "±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "–": "--",
+}  # fmt: skip
+
+
+def _latex(found: list[Table]) -> str:
+    """For a document with \\usepackage{booktabs}."""
+    escape = lambda line: re.sub(r"[&%$#_{}±↓↑–]", lambda match: _LATEX[match[0]], line)
+    lines = []
+    for table in found:
+        caption = escape(f"{table.title}. {table.note}".strip())
+        lines += [
+            r"\begin{table}", r"\centering\footnotesize", f"\\caption{{{caption}}}",
+            f"\\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule",
+            " & ".join(map(escape, ["method", *table.columns])) + r" \\", r"\midrule",
+            *(" & ".join(map(escape, row)) + r" \\" for row in table.rows),
+            r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+        ]  # fmt: skip
+    return "\n".join(lines)
 
 
 def live_header() -> str:
@@ -37,48 +162,8 @@ def live_header() -> str:
     return f"{'method':22}" + "".join(f"{heading(key):>18}" for key in COLUMNS)
 
 
-def live_row(row: dict[str, Any]) -> str:
-    """One method, for the terminal."""
-    return f"{label(row['method']):22}" + "".join(f"{text(key, row[key]):>18}" for key in COLUMNS)
-
-
-def write_tables(directory: Path, rows: list[dict[str, Any]], table: str | None) -> None:
-    """table.csv and table.md of the rows so far."""
-    directory.mkdir(parents=True, exist_ok=True)
-    names = list(dict.fromkeys(["method", *COLUMNS, "n_test", "seed", *(key for row in rows for key in row)]))
-    with (directory / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()})
-    (directory / "table.md").write_text(_markdown(rows, table))
-
-
-def _markdown(rows: list[dict[str, Any]], table: str | None) -> str:
-    title = paper()[table]["title"] if table else "Comparison"
-    lines = [f"# {title}", ""]
-    if table:
-        lines += [
-            f"Ours, and after the slash the paper's (its {table.replace('table', 'Table ')}: 256x256 pixels, "
-            "100,000 training images per scene, four scenes, 300,000 iterations, a GPU). Another scale and other "
-            "scenes: compare the order of the methods, not the numbers.",
-            "",
-        ]
-    lines += [
-        "| method | " + " | ".join(heading(key) for key in COLUMNS) + " |",
-        "|---|" + "---:|" * len(COLUMNS),
-    ]
-    for row in rows:
-        theirs = published(table, row["method"])
-        cells = [text(key, row[key]) + (f" / {theirs[key]:g}" if key in theirs else "") for key in COLUMNS]
-        lines.append(f"| {label(row['method'])} | " + " | ".join(cells) + " |")
-    lines += ["", "Milliseconds per stage, medians:", ""]
-    lines += ["| method | " + " | ".join(stage.replace("_", " ") for stage in STAGES) + " | p95 of a frame |"]
-    lines += ["|---|" + "---:|" * (len(STAGES) + 1)]
-    for row in rows:
-        times = [row.get(f"{stage}_s") for stage in (*STAGES, "time_per_frame_p95")]
-        cells = ["" if t is None else f"{1e3 * t:.2f}" for t in times]
-        lines.append(f"| {label(row['method'])} | " + " | ".join(cells) + " |")
-    if rows:
-        lines += ["", f"N = {rows[0]['n_test']} test views, seed {rows[0]['seed']}; provenance in manifest.json."]
-    return "\n".join(lines) + "\n"
+def live_row(run: dict[str, Any]) -> str:
+    """One run, for the terminal."""
+    if run["status"] != OK:
+        return f"{label(run['method']):22} {run['status']}: {run['message']}"
+    return f"{label(run['method']):22}" + "".join(f"{text(key, run.get(key)):>18}" for key in COLUMNS)

@@ -1,126 +1,67 @@
-"""The metrics of a predicted image against its two reference halves, and the table that describes them."""
+"""The metrics of a predicted image against its two reference halves; `METRICS` of quantities.py describes them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
 from typing import Any
 
+import flip_evaluator
+import numpy as np
 import torch
 from torch import Tensor, nn
-from torchmetrics import MeanSquaredError, Metric
+from torchmetrics import MeanMetric, Metric, MetricCollection
 from torchmetrics.functional.image import structural_similarity_index_measure
-from torchmetrics.image import StructuralSimilarityIndexMeasure
 from torchmetrics.image.fid import FrechetInceptionDistance
+from torchmetrics.image.kid import KernelInceptionDistance
+from torchmetrics.utilities import dim_zero_cat
 
 from nlt.metrics.display import display, expose
 from nlt.metrics.inception import STAGES, load_inception
+from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
-
-@dataclass(frozen=True)
-class MetricInfo:
-    """How a metric is named, ordered and printed."""
-
-    label: str
-    direction: str  # "lower" or "higher" is better
-    format: str  # for str.format's specification
-    unit: str
-    domain: str  # what it is computed on
-
-
-_DISPLAY = "sRGB in [0, 1] at the scene's exposure"
-_LINEAR = "radiance × exposure"
-_FEATURES = "Inception features of sRGB"
-
-METRICS: dict[str, MetricInfo] = {
-    "mse": MetricInfo("MSE", "lower", ".5f", "1", _DISPLAY),
-    "unbiased_mse": MetricInfo("Unbiased MSE", "lower", ".3e", "1", _LINEAR),
-    "reference_noise": MetricInfo("Reference noise", "lower", ".3e", "1", _LINEAR),
-    "mssim": MetricInfo("MSSIM", "higher", ".4f", "1", _DISPLAY),
-    "fid": MetricInfo("FID", "lower", ".2f", "1", _FEATURES),
-    "feature_l1": MetricInfo("Feature L1", "lower", ".4f", "1", f"{_FEATURES}, final pooling"),
-    **{
-        f"feature_l1_{stage}": MetricInfo(
-            f"Feature L1, layer {stage[-1]}", "lower", ".4f", "1", f"{_FEATURES}, {stage}"
-        )
-        for stage in STAGES
-    },
-}
-PERCEPTUAL = ("fid", "feature_l1", *(f"feature_l1_{stage}" for stage in STAGES))
+SLOW = ("flip", *PERCEPTUAL)
 
 # MSSIM as in Wang et al. 2004, with the paper's uniform 7 x 7 window and the image mirrored at its border.
 _SSIM: dict[str, Any] = {"gaussian_kernel": False, "kernel_size": 7, "data_range": 1.0}
 
 
-class RunningMean(Metric):
-    """Mean over all elements of all updates, summed in float64."""
+def unbiased_mse(prediction: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Mean of (f - A)(f - B) of each image (B, 3, H, W), in radiance times exposure: (B,).
 
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
-
-    def _add(self, values: Tensor) -> None:
-        self.total += values.sum(dtype=torch.float64)
-        self.count += values.numel()
-
-    def compute(self) -> Tensor:
-        """Scalar."""
-        return self.total / self.count
-
-
-class UnbiasedMSE(RunningMean):
-    """Mean of (f - A)(f - B), in radiance times exposure; A and B are independent halves of the reference.
-
-    The noise of A and that of B are independent, of mean 0 and independent of f, so the expectation is the
-    MSE against the noise-free image, whereas that against (A + B) / 2 also contains its variance. As an
-    estimate it may be negative.
+    A and B are independent halves of the reference: their noise is independent, of mean 0 and independent of
+    f, so the expectation is the MSE against the noise-free image, whereas that against (A + B) / 2 also
+    contains its variance. As an estimate it may be negative.
     """
-
-    def update(self, prediction: Tensor, a: Tensor, b: Tensor) -> None:
-        """Of three tensors of one shape."""
-        self._add((prediction - a) * (prediction - b))
+    return ((prediction - a) * (prediction - b)).mean((1, 2, 3))
 
 
-class ReferenceNoise(RunningMean):
-    """Mean of (A - B)² / 4, in radiance times exposure: the variance of the reference (A + B) / 2."""
-
-    def update(self, a: Tensor, b: Tensor) -> None:
-        """Of two tensors of one shape."""
-        self._add((a - b).square() / 4)
+def reference_noise(a: Tensor, b: Tensor) -> Tensor:
+    """Mean of (A - B)² / 4 of each image, in radiance times exposure: the variance of the reference (A + B) / 2."""
+    return (a - b).square().mean((1, 2, 3)) / 4
 
 
-class FeatureL1(Metric):
-    """Mean absolute difference of Inception's features between prediction and reference.
+def flip(shown: Tensor, target: Tensor) -> Tensor:
+    """Mean LDR-FLIP (Andersson et al. 2020) of each pair of sRGB images (B, 3, H, W): (B,), at 67 pixels per degree.
+
+    NaN where an image is not finite, which the library would not notice.
+    """
+    values = []
+    for pair in zip(target, shown, strict=True):
+        images = [image.permute(1, 2, 0).float().contiguous().cpu().numpy() for image in pair]
+        finite = all(np.isfinite(image).all() for image in images)
+        values.append(flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[1] if finite else np.nan)
+    return torch.tensor(values, dtype=torch.float64, device=shown.device)
+
+
+def feature_l1(prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Mean absolute difference of Inception's features of each image, by the keys of `METRICS`: (B,) each.
 
     "feature_l1", on the final average pooling, is the paper's Feature L1; the others are on the maps of the
     four stages, before pooling.
     """
-
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    LAYERS = ("pool", *STAGES)
-    KEYS = ("feature_l1", *(f"feature_l1_{stage}" for stage in STAGES))
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("total", torch.zeros(len(self.LAYERS), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros(len(self.LAYERS), dtype=torch.long), dist_reduce_fx="sum")
-
-    def update(self, prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> None:
-        """Of two outputs of `Inception`."""
-        for i, layer in enumerate(self.LAYERS):
-            self.total[i] += (prediction[layer] - reference[layer]).abs().sum(dtype=torch.float64)
-            self.count[i] += prediction[layer].numel()
-
-    def compute(self) -> dict[str, Tensor]:
-        """Scalars by the keys of `METRICS`."""
-        return dict(zip(self.KEYS, (self.total / self.count).unbind(), strict=True))
+    layers = {"feature_l1": "pool", **{f"feature_l1_{stage}": stage for stage in STAGES}}
+    difference = lambda layer: (prediction[layer] - reference[layer]).abs().flatten(1).mean(1, dtype=torch.float64)
+    return {key: difference(layer) for key, layer in layers.items()}
 
 
 class _PooledFeatures(nn.Identity):
@@ -152,23 +93,45 @@ class FID(FrechetInceptionDistance):
             torch.set_num_threads(threads)
 
 
+class KID(KernelInceptionDistance):
+    """Kernel distance of the pooled features (N, 2048): unbiased at any N, so comparable over sizes.
+
+    Up to 1000 samples, all are compared at once; of more, 100 random subsets of 1000. NaN below two samples.
+    """
+
+    def __init__(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it keeps all features
+            super().__init__(feature=_PooledFeatures())
+
+    def compute(self) -> Tensor:  # type: ignore[override]
+        """Scalar."""
+        count = len(dim_zero_cat(self.real_features))
+        if count < 2:
+            return torch.full((), torch.nan, device=self.device)
+        self.subset_size, self.subsets = (count, 1) if count <= 1000 else (1000, 100)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return super().compute()[0]
+
+
 class ImageMetrics(nn.Module):
-    """All metrics of `METRICS`; without `perceptual` only those that need no Inception.
+    """All of `METRICS`; without `perceptual` only those that are quick.
 
     The metrics are submodules, so they move and synchronise with the module that owns this one. Inception
-    is not: it must not end up in checkpoints. Without its weights the perceptual metrics are NaN.
+    is not: it must not end up in checkpoints. Without its weights the metrics that need it are NaN.
     """
 
     def __init__(self, perceptual: bool) -> None:
         super().__init__()
         self.perceptual = perceptual
-        self.mse = MeanSquaredError().set_dtype(torch.float64)
-        self.unbiased_mse = UnbiasedMSE()
-        self.reference_noise = ReferenceNoise()
-        self.mssim = StructuralSimilarityIndexMeasure(**_SSIM).set_dtype(torch.float64)
+        keys = [key for key, metric in METRICS.items() if metric.per_image and (perceptual or key not in SLOW)]
+        means: dict[str, Metric | MetricCollection] = {
+            key: MeanMetric(nan_strategy="disable").set_dtype(torch.float64) for key in keys
+        }
+        self.means = MetricCollection(means, compute_groups=False)
         if perceptual:
-            self.fid = FID()
-            self.feature_l1 = FeatureL1()
+            self.fid, self.kid = FID(), KID()
 
     @torch.no_grad()
     def update(
@@ -178,22 +141,39 @@ class ImageMetrics(nn.Module):
         reference_b: Tensor,
         exposure: Tensor,
         of_reference: dict[str, Tensor] | None = None,
-    ) -> None:
+    ) -> dict[str, Tensor]:
         """Add a batch: linear radiance (B, 3, H, W), W·sr⁻¹·m⁻², and the scenes' exposure (B,) or scalar.
 
         `of_reference`: what `reference_features` gave for it, when several methods share a reference.
+        Returns the metrics of each image (B,), by the keys of `METRICS`, and, where Inception has been run,
+        its pooled features (B, 2048) as "pool".
         """
         f, a, b, shown, target = _domains(prediction, reference_a, reference_b, exposure)
-        self.mse.update(shown, target)
-        self.unbiased_mse.update(f, a, b)
-        self.reference_noise.update(a, b)
-        self.mssim.update(shown, target)
-        if self.perceptual and (inception := load_inception(f.device)):
-            # One pass for all perceptual metrics; prediction and reference apart to halve the memory.
-            of_prediction, of_reference = inception(shown), of_reference or inception(target)
-            self.feature_l1.update(of_prediction, of_reference)
-            self.fid.update(of_prediction["pool"].double(), real=False)
-            self.fid.update(of_reference["pool"].double(), real=True)
+        mssim = structural_similarity_index_measure(shown, target, reduction="none", **_SSIM)
+        assert isinstance(mssim, Tensor)
+        mse = (shown - target).square().mean((1, 2, 3))
+        each = {
+            "mse": mse,
+            "unbiased_mse": unbiased_mse(f, a, b),
+            "reference_noise": reference_noise(a, b),
+            "psnr": -10 * mse.log10(),
+            "mssim": mssim,
+        }
+        if self.perceptual:
+            each["flip"] = flip(shown, target)
+            if inception := load_inception(f.device):
+                # One pass for all perceptual metrics; prediction and reference apart to halve the memory.
+                of_prediction, of_reference = inception(shown), of_reference or inception(target)
+                each |= feature_l1(of_prediction, of_reference)
+                for distance in (self.fid, self.kid):
+                    distance.update(of_prediction["pool"].double(), real=False)
+                    distance.update(of_reference["pool"].double(), real=True)
+                each["pool"] = of_prediction["pool"]
+            else:
+                each |= {key: torch.full_like(mse, torch.nan) for key in PERCEPTUAL if METRICS[key].per_image}
+        for key, mean in self.means.items():
+            mean.update(each[key])
+        return each
 
     @staticmethod
     @torch.no_grad()
@@ -205,34 +185,16 @@ class ImageMetrics(nn.Module):
 
     def compute(self) -> dict[str, Tensor]:
         """Scalars over all updates, of all processes, by the keys of `METRICS`."""
-        values = {
-            "mse": self.mse.compute(),
-            "unbiased_mse": self.unbiased_mse.compute(),
-            "reference_noise": self.reference_noise.compute(),
-            "mssim": self.mssim.compute(),
-        }
+        values = self.means.compute()
         if self.perceptual and load_inception(values["mse"].device):
-            values |= {"fid": self.fid.compute(), **self.feature_l1.compute()}
+            values |= {"fid": self.fid.compute(), "kid": self.kid.compute()}
         elif self.perceptual:
-            values |= dict.fromkeys(PERCEPTUAL, torch.full_like(values["mse"], torch.nan))
-        return values
-
-    @staticmethod
-    @torch.no_grad()
-    def per_image(prediction: Tensor, reference_a: Tensor, reference_b: Tensor, exposure: Tensor) -> dict[str, Tensor]:
-        """mse, mssim and unbiased_mse of every image, (B,) each; arguments as of `update`."""
-        f, a, b, shown, target = _domains(prediction, reference_a, reference_b, exposure)
-        mssim = structural_similarity_index_measure(shown, target, reduction="none", **_SSIM)
-        assert isinstance(mssim, Tensor)
-        return {
-            "mse": (shown - target).square().mean((1, 2, 3)),
-            "mssim": mssim,
-            "unbiased_mse": ((f - a) * (f - b)).mean((1, 2, 3)),
-        }
+            values |= dict.fromkeys(("fid", "kid"), torch.full_like(values["mse"], torch.nan))
+        return {key: values[key] for key in METRICS if key in values}
 
     def reset(self) -> None:
         """Forget all updates."""
-        for metric in self.children():
+        for metric in self.modules():
             if isinstance(metric, Metric):
                 metric.reset()
 

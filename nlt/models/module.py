@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,14 +12,13 @@ import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import ExponentialLR
 
-from nlt.errors import UserError
+from nlt.errors import DivergedError, UserError
 from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
+from nlt.models.method import Batch, Method
 from nlt.models.projection import project
 from nlt.models.unet import UNet
-
-Batch = dict[str, Tensor]
 
 # The names in a batch that the two shared inputs read.
 GBUFFER = ("depth", "normal", "albedo", "view_direction")
@@ -36,12 +36,11 @@ def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
     return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
 
 
-class RenderingModule(L.LightningModule):
-    """Base of all methods. A subclass gives `feature_channels`, `inputs`, `stages` and `features`.
+class RenderingModule(Method, L.LightningModule):
+    """Base of all methods that are trained. A subclass gives `feature_channels`, `inputs`, `stages` and `features`.
 
     A frame is three steps, which can be timed apart: `transport` (3D), `features` (projection, and what else
-    feeds the U-Net) and `synthesize` (2D). A batch is a dict by the names in `nlt.data.sample`; `exposure`,
-    `scene` and `index` are in every batch.
+    feeds the U-Net) and `synthesize` (2D).
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
@@ -87,25 +86,6 @@ class RenderingModule(L.LightningModule):
         """Channels of what `features` returns."""
         raise NotImplementedError
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the batch fields `forward` reads, besides exposure, scene and index."""
-        raise NotImplementedError
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """What has to be rendered for a frame, out of "gbuffer", "photons" and "path_tracing"."""
-        raise NotImplementedError
-
-    @property
-    def pixel_fraction(self) -> float:
-        """Fraction of the pixels that the stage "path_tracing" traces."""
-        return 0.0
-
-    def mask(self, batch: Batch, height: int, width: int) -> Tensor:
-        """The pixels (B, 1, height, width) that the stage "path_tracing" traces; all, unless overridden."""
-        return torch.ones(len(batch["scene"]), 1, height, width, dtype=torch.bool, device=self.device)
-
     def transport(self, batch: Batch) -> Any:
         """Light transport: whatever `features` takes up again; None for a method without."""
         return None
@@ -132,16 +112,17 @@ class RenderingModule(L.LightningModule):
         # Out of what layout and, under autocast, precision the convolutions ran in.
         return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
 
-    def forward(self, batch: Batch) -> Tensor:
-        """The predicted linear radiance (B, 3, H, W), W·sr⁻¹·m⁻²."""
-        return self.synthesize(batch, self.features(batch, self.transport(batch)))
+    def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
+        """Transport, projection, synthesis."""
+        transport = lambda batch, _: self.transport(batch)
+        return {"transport": transport, "projection": self.features, "synthesis": self.synthesize}
 
     # --- training and evaluation ---
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.loss(self(batch), batch["noisy"], batch["exposure"])
         if not loss.isfinite():
-            raise UserError(
+            raise DivergedError(
                 f"train/loss is {loss.item()} at step {self.global_step}, in a batch of scenes "
                 f"{batch['scene'].tolist()}, samples {batch['index'].tolist()}: check these for values that "
                 "are not finite, or lower model.init_args.learning_rate"

@@ -1,0 +1,36 @@
+"""Test samples put before the renderer again: for the clock, and for methods that path trace."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from nlt.data.datamodule import LightTransportDataset
+from nlt.data.render import SampleRenderer
+from nlt.rendering.renderer import Renderer
+from nlt.scenes.camera import Camera
+
+
+class Frames:
+    """The samples of a dataset's split; a scene is loaded when one of its samples is first asked for."""
+
+    def __init__(self, dataset: LightTransportDataset) -> None:
+        self.dataset = dataset
+        self._renderer = cache(lambda scene: SampleRenderer(dataset.spec, scene))
+        self.traced = cache(self._traced)
+
+    def place(self, index: int) -> tuple[Renderer, Camera]:
+        """Put a sample's scene into its state; what renders it, and its camera."""
+        scene, row = divmod(index, self.dataset.spec.count(self.dataset.split))
+        render = self._renderer(scene)
+        return render.renderer, render.place(self.dataset.split, row)
+
+    def _traced(self, index: int, spp: int) -> Tensor:
+        """Path-traced radiance (3, H, W) of a sample; seeds of its own, that no stored image has."""
+        renderer, camera = self.place(index)
+        spec, split = self.dataset.spec, self.dataset.split
+        scene, row = divmod(index, spec.count(split))
+        (seed,) = spec.seeds(split, scene, row).spawn(2 + spp)[-1].generate_state(1)  # 0 and 1: state and view
+        return torch.from_numpy(renderer.radiance(camera, spp, int(seed)))

@@ -1,0 +1,21 @@
+"""`nlt report DIR`: whatever is made of stored results. Made again from the same results, no byte changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
+from nlt.evaluation.results import load
+from nlt.evaluation.tables import write_tables
+
+
+def draw(directory: str | Path) -> None:
+    """Tables and figures of the results in a directory.
+
+    Raises:
+        UserError: there are none.
+    """
+    results = load(directory)
+    write_tables(results)
+    draw_samples(results)
+    draw_speed_accuracy(results)

@@ -1,0 +1,173 @@
+"""The results of a comparison on disk, and the one way to read them: no dataset, no renderer, no method needed.
+
+results/NAME/ holds
+
+- `manifest.json`: command, commit, device, versions, configs; `methods` in the table's order, `table` (the paper's,
+  or null), `n_test`, `seeds`, `shown` (the indices of the test views whose images are kept);
+- `runs.csv`: a row per method and seed with every number as it was measured, by the keys of `QUANTITIES`; `status`
+  is ok, diverged or failed, and `message` says why; `family` is the method's class, `spp` and `pixel_fraction` what
+  of a frame it path traces;
+- `views.csv`: a row per method, seed and test view with the metrics of that image. `fid_without` and `kid_without`
+  are those of the test set without the view's jackknife group: they carry these metrics' uncertainty;
+- `images/METHOD.npz`, not in git: `radiance` (V, 3, H, W), float16, linear, of the first seed, for the shown views.
+  `images/reference.npz` also has `exposure` (V,) and `view` (V,); `images/noisy.npz` is the teaching input, and
+  `images/gbuffer.npz` has `albedo` and `normal` (V, 3, H, W), `depth` (V, 1, H, W).
+
+Tables, figures and claims are made from these alone.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from nlt.data.files import write_bytes
+from nlt.errors import UserError
+from nlt.metrics.quantities import QUANTITIES
+
+MANIFEST, RUNS, VIEWS, IMAGES = "manifest.json", "runs.csv", "views.csv", "images"
+OK, DIVERGED, FAILED = "ok", "diverged", "failed"
+_LEVEL, _RESAMPLES = 0.95, 2000
+
+
+@dataclass(frozen=True)
+class Results:
+    """What `load` reads; `runs` and `views` are the rows of the two files, numbers as numbers."""
+
+    directory: Path
+    manifest: Mapping[str, Any]
+    runs: list[dict[str, Any]]
+    views: list[dict[str, Any]]
+
+    @cached_property
+    def methods(self) -> list[str]:
+        """Those that were run, in the table's order; a method that diverged or failed is among them."""
+        return list(dict.fromkeys(run["method"] for run in self.runs))
+
+    def runs_of(self, method: str) -> list[dict[str, Any]]:
+        """A method's runs that came to an end."""
+        return [run for run in self.runs if run["method"] == method and run["status"] == OK]
+
+    def status(self, method: str) -> str:
+        """ "ok", or what became of how many runs, such as "1 of 3 diverged"."""
+        runs = [run for run in self.runs if run["method"] == method]
+        bad = [run["status"] for run in runs if run["status"] != OK]
+        return ", ".join(f"{bad.count(s)} of {len(runs)} {s}" for s in dict.fromkeys(bad)) or OK
+
+    def values(self, method: str, key: str) -> np.ndarray:
+        """(S,) of the finished seeds; empty where it was not measured."""
+        values = np.array([run.get(key, math.nan) for run in self.runs_of(method)], float)
+        return values[np.isfinite(values)]
+
+    def mean(self, method: str, key: str) -> float:
+        """Over seeds; NaN where it was not measured."""
+        values = self.values(method, key)
+        return float(values.mean()) if len(values) else math.nan
+
+    def std(self, method: str, key: str) -> float:
+        """Sample standard deviation over seeds; NaN below two."""
+        values = self.values(method, key)
+        return float(values.std(ddof=1)) if len(values) > 1 else math.nan
+
+    def per_view(self, method: str, key: str) -> np.ndarray:
+        """(N,) of the test views in order, means over seeds; empty where it was not measured."""
+        by_view: dict[int, list[float]] = {}
+        for row in self._views_of.get(method, []):
+            by_view.setdefault(row["view"], []).append(row.get(key, math.nan))
+        values = np.array([np.mean(by_view[view]) for view in sorted(by_view)])
+        return values if np.isfinite(values).all() else np.zeros(0)
+
+    @cached_property
+    def _views_of(self) -> dict[str, list[dict[str, Any]]]:
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for row in self.views:
+            rows.setdefault(row["method"], []).append(row)
+        return rows
+
+    def interval(self, method: str, key: str) -> tuple[float, float]:
+        """95% bootstrap interval over test images of a per-image metric; NaN below two images."""
+        values = self.per_view(method, key) if QUANTITIES[key].per_image else np.zeros(0)
+        if len(values) < 2:
+            return math.nan, math.nan
+        found = scipy.stats.bootstrap(
+            (values,), np.mean, confidence_level=_LEVEL, n_resamples=_RESAMPLES, method="percentile",
+            rng=np.random.default_rng(0),
+        ).confidence_interval  # fmt: skip
+        return float(found.low), float(found.high)
+
+    def images(self, name: str) -> dict[str, np.ndarray] | None:
+        """The arrays of images/`name`.npz: a method, "reference", "noisy" or "gbuffer"; None where there is none."""
+        path = self.directory / IMAGES / f"{name}.npz"
+        if not path.exists():
+            return None
+        with np.load(path) as file:
+            return dict(file)
+
+
+def load(directory: str | Path) -> Results:
+    """The results of a comparison.
+
+    Raises:
+        UserError: there are none, or they cannot be read.
+    """
+    directory = Path(directory)
+    try:
+        manifest = json.loads((directory / MANIFEST).read_text())
+        runs, views = (_read_rows(directory / name) for name in (RUNS, VIEWS))
+    except FileNotFoundError as error:
+        raise UserError(f"{error.filename}: missing; `nlt compare` writes it, in the directory of its --out") from None
+    except ValueError as error:
+        raise UserError(f"{directory / MANIFEST}: damaged ({error}); run `nlt compare` again") from None
+    return Results(directory, manifest, runs, views)
+
+
+def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Rows as CSV with a column for every key; NaN and what a row lacks are left empty."""
+    rows = list(rows)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval="")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()})
+    write_bytes(path, text.getvalue().encode())
+
+
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    with path.open(newline="") as file:
+        return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _value(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text or math.nan
+
+
+def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
+    """The manifest, whole."""
+    write_bytes(directory / MANIFEST, (json.dumps(manifest, indent=1, default=str) + "\n").encode())
+
+
+def write_images(directory: Path, name: str, **arrays: np.ndarray) -> None:
+    """images/`name`.npz, floats as float16; what is above its range is clamped to it."""
+    most = float(np.finfo(np.float16).max)
+    half = {
+        key: np.clip(array, -most, most).astype(np.float16) if array.ndim == 4 else array
+        for key, array in arrays.items()
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **half)  # type: ignore[arg-type]
+    write_bytes(directory / IMAGES / f"{name}.npz", buffer.getvalue())

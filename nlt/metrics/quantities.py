@@ -1,0 +1,64 @@
+"""Everything that is measured of a method: name, direction, unit, how it is printed. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+# The stages of a frame: rendered, then computed. A method pays for those it needs.
+STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
+INCEPTION_STAGES = ("layer0", "layer1", "layer2", "layer3")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How a number is named, ordered and printed."""
+
+    label: str
+    direction: Literal["lower", "higher"]  # which is better
+    format: str  # for str.format's specification, of value * scale
+    unit: str = "1"  # of value * scale
+    scale: float = 1.0  # from what is stored, an SI unit, to what is printed
+    domain: str = ""  # what it is computed on
+    per_image: bool = False  # the mean over images of a value that each image has
+
+
+_DISPLAY = "sRGB in [0, 1] at the scene's exposure"
+_LINEAR = "radiance × exposure"
+_FEATURES = "Inception features of sRGB"
+
+
+def _image(
+    label: str, direction: Literal["lower", "higher"], form: str, domain: str, unit: str = "1", per_image: bool = True
+) -> Quantity:
+    return Quantity(label, direction, form, unit, domain=domain, per_image=per_image)
+
+
+METRICS: dict[str, Quantity] = {
+    "mse": _image("MSE", "lower", ".5f", _DISPLAY),
+    "unbiased_mse": _image("Unbiased MSE", "lower", ".3e", _LINEAR),
+    "reference_noise": _image("Reference noise", "lower", ".3e", _LINEAR),
+    "psnr": _image("PSNR", "higher", ".2f", _DISPLAY, "dB"),
+    "mssim": _image("MSSIM", "higher", ".4f", _DISPLAY),
+    "flip": _image("FLIP", "lower", ".4f", _DISPLAY),
+    "fid": _image("FID", "lower", ".2f", _FEATURES, per_image=False),
+    "kid": _image("KID", "lower", ".4f", _FEATURES, per_image=False),
+    "feature_l1": _image("Feature L1", "lower", ".4f", f"{_FEATURES}, final pooling"),
+    **{
+        f"feature_l1_{stage}": _image(f"Feature L1, layer {stage[-1]}", "lower", ".4f", f"{_FEATURES}, {stage}")
+        for stage in INCEPTION_STAGES
+    },
+}
+PERCEPTUAL = tuple(key for key, metric in METRICS.items() if metric.domain.startswith(_FEATURES))
+
+COSTS: dict[str, Quantity] = {
+    "time_per_frame_s": Quantity("time / frame", "lower", ".4f", "s"),
+    **{f"{stage}_s": Quantity(stage.replace("_", " "), "lower", ".2f", "ms", 1e3) for stage in STAGES},
+    "time_per_frame_p95_s": Quantity("p95 of a frame", "lower", ".2f", "ms", 1e3),
+    "parameters": Quantity("parameters", "lower", ",.0f"),
+    "flops": Quantity("FLOPs / frame", "lower", ".2f", "G", 1e-9),
+    "peak_memory_bytes": Quantity("peak memory", "lower", ".1f", "MiB", 2**-20),
+    "train_s": Quantity("training", "lower", ".1f", "min", 1 / 60),
+    "images_seen": Quantity("images seen", "lower", ",.0f"),
+}
+QUANTITIES: dict[str, Quantity] = METRICS | COSTS
