@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from nlt import __version__
@@ -66,7 +67,35 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.report import draw
 
         draw(options.directory)
+    elif options.command == "scenes":
+        _scenes(options)
     return 0
+
+
+def _scenes(options: argparse.Namespace) -> None:
+    if options.action == "list":
+        from nlt.scenes.catalog import listing
+
+        print(listing())
+        return
+    if options.action == "preview":
+        from nlt.evaluation.preview import contact_sheet
+
+        views, size = options.views, options.resolution
+        contact_sheet(options.names, options.output, views, size, options.spp, options.experiment, options.seed)
+        print(options.output)
+        return
+    from nlt.rendering.variant import use_variant
+
+    use_variant()
+    from nlt.scenes import describe
+
+    if options.action == "show":
+        print(describe.show(options.name))
+    elif options.action == "check":
+        print(describe.check(options.file))
+    else:
+        print(describe.add(options.file, options.name, options.output))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,7 +128,28 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
     report = commands.add_parser("report", help="draw the tables and figures of results anew, on any machine")
     report.add_argument("directory", help="of the results, as `nlt compare` wrote them")
+    _add_scenes(commands.add_parser("scenes", help="scenes: list, show, check, preview, add"))
     return parser
+
+
+def _add_scenes(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(dest="action", required=True, metavar="action")
+    actions.add_parser("list", help="the descriptions of configs/scenes")
+    show = actions.add_parser("show", help="a description in words, and what its scene has")
+    show.add_argument("name", help="of a description, or the path of one")
+    check = actions.add_parser("check", help="load a scene file; what it has, what it lacks, what to make of it")
+    add = actions.add_parser("add", help="write a description of a scene file, to edit")
+    for action in (check, add):
+        action.add_argument("file", type=Path, help="Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ")
+    add.add_argument("--name", help="of the scene (default: the file's, or its folder's for scene.xml)")
+    add.add_argument("-o", "--output", type=Path, help="where to (default: configs/scenes/NAME.yaml)")
+    preview = actions.add_parser("preview", help="a contact sheet: a row per scene, random views of random states")
+    preview.add_argument("names", nargs="+", help="descriptions, by name or path")
+    preview.add_argument("-o", "--output", type=Path, default=Path("preview.png"))
+    for option, default in (("--views", 4), ("--resolution", 256), ("--spp", 64)):
+        preview.add_argument(option, type=_positive, default=default)
+    preview.add_argument("--experiment", type=_experiment, default="fixed_lights")
+    preview.add_argument("--seed", type=int, default=0)
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -107,6 +157,14 @@ def _pair(text: str) -> tuple[str, str]:
     if not (key and equals and value):
         raise argparse.ArgumentTypeError(f"must be KEY=VALUE, is {text!r}")
     return key, value
+
+
+def _experiment(text: str) -> str:
+    from nlt.scenes.description import EXPERIMENTS
+
+    if text not in EXPERIMENTS:
+        raise argparse.ArgumentTypeError(f"must be one of {', '.join(EXPERIMENTS)}, is {text!r}")
+    return text
 
 
 def _positive(text: str) -> int:

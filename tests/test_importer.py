@@ -1,5 +1,7 @@
 """Scene files of every dialect become the same scene: against twins in Mitsuba 3's own words, and analytic values."""
 
+import re
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,12 +9,17 @@ import trimesh
 from conftest import write_yaml
 from PIL import Image
 from test_scenes import refused
+from tiny import DATASET
 
+from nlt.cli import main
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec
 from nlt.scenes import importer
-from nlt.scenes.assembly import Scene
+from nlt.scenes.assembly import Scene, read_shape
 from nlt.scenes.description import load_description
 from nlt.scenes.lanes import launch
 from nlt.scenes.pointcloud import material
+from nlt.scenes.proposal import propose
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="55"/><transform name="toWorld">{pose}</transform>
     <sampler type="sobol"><integer name="sampleCount" value="$spp"/></sampler>
@@ -309,3 +316,99 @@ def test_imported_scene_is_assembled(folder):
     assert load_description(str(file)).digest == before
     write(folder / "materials.xml", MATERIALS.replace("0.5, 0.4, 0.3", "0.5, 0.4, 0.2"))
     assert load_description(str(file)).digest != before
+
+
+def furnished(folder, scale):
+    """A room of 4 x 2.6 x 3 m, `scale` units per metre: a table of two parts with a cup on it, a crate, a picture."""
+    boxes = {  # extents and centre, metres
+        "table_top": ((1.2, 0.05, 0.7), (-1, 0.725, 0.2)),
+        "table_leg": ((0.1, 0.7, 0.1), (-1, 0.35, 0.2)),
+        "cup": ((0.12, 0.15, 0.12), (-1.2, 0.825, 0.2)),
+        "crate": ((0.4, 0.5, 0.4), (0.8, 0.25, -0.5)),
+        "picture": ((0.6, 0.4, 0.02), (0.5, 1.5, -1.49)),
+    }
+    room = trimesh.creation.box((4, 2.6, 3))
+    room.apply_translation([0, 1.3, 0])
+    room.invert()
+    lamp = trimesh.creation.box((0.5, 0.02, 0.5))
+    lamp.apply_translation([0, 2.59, 0])
+    meshes = {"room": room, "lamp": lamp}
+    for name, (extents, centre) in boxes.items():
+        meshes[name] = trimesh.creation.box(extents)
+        meshes[name].apply_translation(centre)
+    xml = ""
+    for name, mesh in meshes.items():
+        mesh.apply_scale(scale).export(folder / f"{name}.ply")
+        glow = '<emitter type="area"><rgb name="radiance" value="9"/></emitter>' if name == "lamp" else ""
+        xml += f"""<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>
+            <boolean name="faceNormals" value="true"/><bsdf type="twosided">{DIFFUSE}</bsdf>{glow}</shape>"""
+    return write(folder / "my room.xml", f'<scene version="0.6.0">{xml}</scene>'), meshes
+
+
+@pytest.mark.parametrize("scale", [1, 100])
+def test_proposals(tmp_path, scale):
+    path, meshes = furnished(tmp_path, scale)
+    imported = importer.read(path)
+    shapes = {s.id(): read_shape(s) for s in imported.scene.shapes()}
+    found = propose(imported.scene, shapes, imported.up)
+    assert found.up == "y" and found.units_per_metre == scale
+    np.testing.assert_allclose(found.room / scale, [[-2, 0, -1.5], [2, 2.6, 1.5]], atol=0.01)
+    assert {frozenset(o.shapes) for o in found.objects} == {
+        frozenset({"table_top", "table_leg", "cup"}), frozenset({"crate"}), frozenset({"picture"}),
+    }  # fmt: skip
+    assert (found.camera[0] > found.room[0]).all() and (found.camera[1] < found.room[1]).all()
+    assert found.light.box[1, 1] < 2.58 * scale
+    # Brute force: wherever a box lets an object go, it meets no other object and leaves the room nowhere.
+    rng = np.random.default_rng(0)
+    for movable in found.objects:
+        assert np.ptp(movable.box, axis=0).max() > 0.3 * scale, f"{movable.name} can move"
+        for move in rng.uniform(*movable.box, size=(200, 3)):
+            for low, high in (meshes[s].bounds + move for s in movable.shapes):
+                assert (low > found.room[0] - 0.05 * scale).all() and (high < found.room[1] + 0.05 * scale).all()
+                for name in set(meshes) - {"room", *movable.shapes}:
+                    overlap = np.minimum(high, meshes[name].bounds[1]) - np.maximum(low, meshes[name].bounds[0])
+                    assert overlap.min() < 0.03 * scale, f"{movable.name} meets {name}"
+
+
+def test_check_and_add(tmp_path, capsys):
+    """`check` says what is there, `add` writes a description that loads, renders, and is never overwritten."""
+    path, _ = furnished(tmp_path, 100)
+    assert main(["scenes", "check", str(path)]) == 0
+    report = capsys.readouterr().out
+    for fragment in (
+        "shapes: 7, triangles: 84",
+        "1 area emitters: lamp",
+        "7 diffuse",
+        "up: +y",
+        "100 (a guess",
+        "crate",
+    ):
+        assert fragment in report
+    file = tmp_path / "scene.yaml"
+    assert main(["scenes", "add", str(path), "--name", "my_room", "-o", str(file)]) == 0
+    description = load_description(str(file))
+    assert description.name == "my_room" and len(description.objects) == 3 and description.light is not None
+    np.testing.assert_allclose(description.room, [[-2, 0, -1.5], [2, 2.6, 1.5]], atol=0.01)
+    for experiment in ("fixed_lights", "moving_lights"):
+        spec = DatasetSpec(**{**DATASET, "scenes": [str(file)], "experiment": experiment})
+        sample = SampleRenderer(spec, 0).sample("test", 0)
+        assert all(np.isfinite(v).all() for v in sample.values()) and sample["reference_a"].mean() > 0.01
+    capsys.readouterr()
+    assert main(["scenes", "show", str(file)]) == 0
+    assert "movable objects: 3" in capsys.readouterr().out
+    assert main(["scenes", "add", str(path), "-o", str(file)]) == 2
+    assert f"{file}: is there already" in capsys.readouterr().err
+
+
+def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):
+    for name in ("good", "far"):
+        write_yaml(tmp_path / f"{name}.yaml", **({"source": "far/scene.xml"} if name == "far" else {}))
+    write(tmp_path / "broken.yaml", "camera: [1\n")
+    for module in ("nlt.paths", "nlt.scenes.catalog"):
+        monkeypatch.setattr(f"{module}.config_names", lambda kind: ["broken", "far", "good"])
+    monkeypatch.setattr("nlt.scenes.description.find_config", lambda kind, name: tmp_path / f"{name}.yaml")
+    assert main(["scenes", "list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert ["far", "not here", "0", "no", "path"] in [re.split(r"  +", line) for line in lines]
+    assert any(line.startswith("good") and "built in" in line for line in lines)
+    assert any(line.startswith("broken") and "YAML" in line for line in lines)

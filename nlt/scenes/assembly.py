@@ -58,7 +58,7 @@ class Scene:
         self.description, self.experiment = description, experiment
         self.movables = description.movables(experiment)
         own_lights = experiment != "moving_lights"
-        source = _load(description)
+        source = load_source(description)
         meshes = {shape.id(): shape for shape in source.shapes()}
         self._check_shapes(set(meshes))
         self.environment = source.environment() if own_lights else None
@@ -66,7 +66,7 @@ class Scene:
             raise UserError(
                 f"{description.file}: source: {description.source} has no emitters; add one, or use moving_lights"
             )
-        self.shapes = {name: _read(mesh, description, own_lights) for name, mesh in meshes.items()}
+        self.shapes = {name: read_shape(mesh, description.units_per_metre, own_lights) for name, mesh in meshes.items()}
         if not own_lights:
             meshes = {n: _without_emitter(m, self.shapes[n]) if m.is_emitter() else m for n, m in meshes.items()}
         self._assemble(meshes)
@@ -200,7 +200,8 @@ def _facing_down(up: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(-up, first), -up], axis=1)
 
 
-def _load(description: SceneDescription) -> Any:
+def load_source(description: SceneDescription) -> Any:
+    """The scene that a description names, live and as it is in its file."""
     if description.path is None:
         from nlt.scenes import builtin
 
@@ -212,12 +213,13 @@ def _load(description: SceneDescription) -> Any:
     return importer.load(description.path)
 
 
-def _read(mesh: Any, description: SceneDescription, own_lights: bool) -> Shape:
+def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True) -> Shape:
+    """A live mesh, in metres; without its emitter if the scene's own lights are off."""
     parameters = mi.traverse(mesh)
     uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
     return Shape(
         mesh.id(),
-        np.array(parameters["vertex_positions"], float).reshape(-1, 3) / description.units_per_metre,
+        np.array(parameters["vertex_positions"], float).reshape(-1, 3) / units_per_metre,
         np.array(parameters["faces"]).reshape(-1, 3).astype(np.int64),
         uv,
         mesh.bsdf(),

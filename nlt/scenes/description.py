@@ -155,11 +155,11 @@ class _Section:
         return box
 
 
-def load_description(name: str) -> SceneDescription:
+def load_description(name: str, need_source: bool = True) -> SceneDescription:
     """Read `configs/scenes/<name>.yaml`, or the file at a path.
 
     Raises:
-        UserError: the file or its scene is missing, a key is unknown or missing, a box is empty.
+        UserError: the file, or its scene where one is needed, is missing; a key is unknown or missing; a box is empty.
     """
     file = find_config("scenes", name)
     try:
@@ -211,7 +211,7 @@ def load_description(name: str) -> SceneDescription:
     return SceneDescription(
         name=str(top.get("name", file.stem)),
         file=file,
-        source=_find_source(file, str(top.get("source"))),
+        source=_find_source(file, str(top.get("source")), need_source),
         units_per_metre=1.0 / scale,
         up=np.array(UP[up]),
         exposure=float(top.positive("exposure", default=1.0)),
@@ -225,13 +225,15 @@ def load_description(name: str) -> SceneDescription:
     )
 
 
-def _find_source(file: Path, source: str) -> str:
+def _find_source(file: Path, source: str, needed: bool) -> str:
     if source.startswith(BUILTIN):
         return source
     tried = [Path(source)] if Path(source).is_absolute() else [file.parent / source, scenes_root() / source]
     for path in tried:
         if path.is_file():
             return str(path.resolve())
+    if not needed:
+        return str(tried[-1])
     raise UserError(
         f"{file}: source: no scene file at {' or '.join(map(str, tried))}; set NLT_SCENES to the scenes' folder"
     )

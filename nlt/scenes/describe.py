@@ -1,0 +1,165 @@
+"""`nlt scenes show`, `check` and `add`: what a scene holds, in words, and a first description of a new one."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from nlt.errors import UserError
+from nlt.paths import CONFIGS, scenes_root
+from nlt.scenes.assembly import Shape, load_source, read_shape
+from nlt.scenes.description import MATERIALS, load_description
+from nlt.scenes.importer import Imported, read
+from nlt.scenes.pointcloud import material
+from nlt.scenes.proposal import Proposal, propose
+
+_FAR = 1e6  # of float32's 7 digits none is left for a millimetre
+
+
+def show(name: str) -> str:
+    """A description in words (lengths in metres), and what its scene has."""
+    description = load_description(name)
+    source = load_source(description)
+    shapes = [read_shape(mesh, description.units_per_metre) for mesh in source.shapes()]
+    lines = [
+        f"{description.name}: {description.file}",
+        f"source: {description.source}, {description.units_per_metre:g} units per metre",
+        f"camera: {_span(description.camera)} m, field of view {description.fov:g} degrees",
+        f"room: {'not given' if description.room is None else _span(description.room) + ' m'}",
+        f"exposure: {description.exposure:g}; teacher: {description.teacher}",
+    ]
+    if description.light is not None:
+        size, box = description.light.size, description.light.box
+        lines.append(f"moving light: {size[0]:.3g} x {size[1]:.3g} m in {_span(box)} m")
+    lines += _objects((o.name, o.shapes, o.box) for o in description.objects)
+    return "\n".join([*lines, *_contents(shapes, source.environment() is not None)])
+
+
+def check(path: Path) -> str:
+    """Load a scene file and say what it holds and what a description of it could say; lengths in scene units.
+
+    Raises:
+        UserError: it cannot be loaded, see `importer.read`.
+    """
+    imported, shapes, proposal = _propose(path)
+    environment = imported.scene.environment() is not None
+    because = proposal.because
+    lines = [
+        str(path),
+        *_contents(shapes.values(), environment),
+        f"bounding box: {_span(proposal.bounds)}",
+        f"up: +{proposal.up} ({because['up']})",
+        f"units per metre: {proposal.units_per_metre:g} ({because['units_per_metre']})",
+        f"room: {_span(proposal.room)} ({because['room']})",
+        f"camera: {_span(proposal.camera)} ({because['camera']})",
+        f"ceiling: {proposal.room[1, 'xyz'.index(proposal.up)]:.4g}; moving light: "
+        f"{proposal.light.size[0]:.3g} x {proposal.light.size[1]:.3g} in {_span(proposal.light.box)}",
+        *_objects((o.name, o.shapes, o.box) for o in proposal.objects),
+    ]
+    return "\n".join(lines + [f"warning: {w}" for w in _warnings(imported, proposal)])
+
+
+def add(path: Path, name: str | None = None, output: Path | None = None) -> Path:
+    """Write a description of a scene file to edit; returns where.
+
+    Raises:
+        UserError: the file cannot be loaded, or the description exists already.
+    """
+    name = name or re.sub(r"[^\w-]+", "_", path.resolve().parent.name if path.stem == "scene" else path.stem)
+    file = output or CONFIGS / "scenes" / f"{name}.yaml"
+    if file.exists():
+        raise UserError(f"{file}: is there already; choose another with --name or -o, or delete it")
+    imported, _, proposal = _propose(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(_yaml(path, name, imported, proposal))
+    return file
+
+
+def _propose(path: Path) -> tuple[Imported, dict[str, Shape], Proposal]:
+    imported = read(path)
+    shapes = {mesh.id(): read_shape(mesh) for mesh in imported.scene.shapes()}
+    for shape in shapes.values():
+        if not np.isfinite(shape.vertices).all():
+            raise UserError(f"{path}: shape {shape.id}: a vertex is not a finite number; repair the mesh")
+    return imported, shapes, propose(imported.scene, shapes, imported.up)
+
+
+def _warnings(imported: Imported, proposal: Proposal) -> list[str]:
+    said = list(imported.warnings)
+    if not imported.scene.emitters():
+        said.append("nothing emits light: only moving_lights will work")
+    if np.abs(proposal.bounds).max() > _FAR:
+        said.append(
+            f"coordinates reach {np.abs(proposal.bounds).max():.3g}: too far for float32; move or scale the scene"
+        )
+    return said
+
+
+def _contents(shapes: Iterable[Shape], environment: bool) -> list[str]:
+    shapes = list(shapes)
+    kinds = Counter(material(shape.bsdf) for shape in shapes)
+    emitting = [shape.id for shape in shapes if shape.emitter is not None]
+    lights = f"{len(emitting)} area emitters{': ' + _some(emitting) if emitting else ''}"
+    return [
+        f"shapes: {len(shapes)}, triangles: {sum(len(shape.faces) for shape in shapes):,}",
+        f"light: {lights}{'; an environment' if environment else '; no environment'}",
+        f"materials: {', '.join(f'{kinds[kind]} {kind}' for kind in MATERIALS if kinds[kind])}",
+    ]
+
+
+def _objects(objects: Iterable[tuple[str, tuple[str, ...], np.ndarray]]) -> list[str]:
+    listed = [f"  {name}: {_some(shapes)}; moves by {_span(box)}" for name, shapes, box in objects]
+    return [f"movable objects: {len(listed)}", *listed]
+
+
+def _some(names: Iterable[str]) -> str:
+    listed = list(names)
+    return ", ".join(listed[:6]) + (f" and {len(listed) - 6} more" if len(listed) > 6 else "")
+
+
+def _span(box: np.ndarray) -> str:
+    return " to ".join(_numbers(corner) for corner in box)
+
+
+def _numbers(values: Any) -> str:
+    return "[" + ", ".join(f"{v + 0:.4g}" for v in np.where(np.abs(values) < 1e-6, 0, values)) + "]"
+
+
+def _yaml(path: Path, name: str, imported: Imported, proposal: Proposal) -> str:
+    root, source = scenes_root().resolve(), path.resolve()
+    because, light = proposal.because, proposal.light
+    pair = lambda box: f"[{_numbers(box[0])}, {_numbers(box[1])}]"
+    warnings = "".join(f"# {w}\n" for w in _warnings(imported, proposal))
+    objects = "".join(
+        f"  {_word(o.name)}: {{shapes: [{', '.join(map(_word, o.shapes))}], box: {pair(o.box)}}}\n"
+        for o in proposal.objects
+    )
+    return f"""# Written by `nlt scenes add`: guesses to check and edit. Lengths in scene units.
+# See it with: nlt scenes preview {name} -o {name}.png
+{warnings}name: {_word(name)}
+source: {_word(str(source.relative_to(root) if source.is_relative_to(root) else source))}
+units_per_metre: {proposal.units_per_metre:g}  # {because["units_per_metre"]}
+up: {proposal.up}  # {because["up"]}
+exposure: 1.0  # check: raise it if the preview is dark, lower it if it is burnt out
+fov: 70.0
+camera: {{min: {_numbers(proposal.camera[0])}, max: {_numbers(proposal.camera[1])}}}  # {because["camera"]}
+room: {pair(proposal.room)}  # check: {because["room"]}
+# Check the objects and rename them: shapes that touch were taken as one; a box holds the allowed translations.
+objects:{"" if proposal.objects else " {}"}
+{objects}moving_light:  # check: below the ceiling and above everything else
+  size: {_numbers(light.size)}
+  radiance: {_numbers(light.radiance)}
+  box: {pair(light.box)}
+"""
+
+
+def _word(text: str) -> str:
+    """A string as YAML; quoted if it has to be."""
+    return text if re.fullmatch(r"[\w./-]+", text) and yaml.safe_load(text) == text else json.dumps(text)
