@@ -55,10 +55,8 @@ def _run(arguments: list[str]) -> int:
 
         slurm = dict(options.slurm)
         print(generate(*load_spec(options.config), options.workers, options.scheduler, slurm))
-    elif options.command == "show":
-        from nlt.evaluation.show import show_sample
-
-        print(show_sample(options.dataset, options.split, options.index, options.output))
+    elif options.command == "data":
+        _run_data(options)
     elif options.command == "compare":
         from nlt.evaluation.compare import compare
 
@@ -111,11 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     generate.add_argument(
         "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE", help="such as partition=gpu, time=60"
     )
-    show = commands.add_parser("show", help="draw the components of a sample")
-    show.add_argument("dataset", help="directory of a dataset, as `nlt generate` prints it")
-    show.add_argument("--split", choices=("val", "test"), default="test")
-    show.add_argument("--index", type=int, default=0)
-    show.add_argument("-o", "--output", default="sample.png")
+    data = commands.add_parser("data", help="look at a dataset: show, verify, stats")
+    _add_data(data)
     for name, text in _LIGHTNING.items():
         # Handed to Lightning's own parser before this one sees it; here for the help.
         commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")
@@ -150,6 +145,34 @@ def _add_scenes(parser: argparse.ArgumentParser) -> None:
         preview.add_argument(option, type=_positive, default=default)
     preview.add_argument("--experiment", type=_experiment, default="fixed_lights")
     preview.add_argument("--seed", type=int, default=0)
+
+
+def _add_data(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(dest="action", required=True, metavar="action")
+    show = actions.add_parser("show", help="draw the components of a sample")
+    show.add_argument("--split", choices=("val", "test"), default="test")
+    show.add_argument("--index", type=int, default=0)
+    show.add_argument("-o", "--output", default="sample.png")
+    verify = actions.add_parser("verify", help="read every byte and say all that is wrong")
+    stats = actions.add_parser("stats", help="bytes and seconds by field, here and for the paper's full dataset")
+    stats.add_argument("--workers", type=_positive, help="side by side (default: as many as cores)")
+    for action in (show, verify, stats):
+        action.add_argument("dataset", help="directory or URL of a dataset, as `nlt generate` prints it")
+
+
+def _run_data(options: argparse.Namespace) -> None:
+    if options.action == "show":
+        from nlt.evaluation.show import show_sample
+
+        print(show_sample(options.dataset, options.split, options.index, options.output))
+    elif options.action == "verify":
+        from nlt.data.verify import verify
+
+        verify(options.dataset)
+    else:
+        from nlt.data.stats import stats
+
+        print(stats(options.dataset, options.workers))
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -24,7 +24,7 @@ from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 
 # Mitsuba's memory grows with every scene and state: a process renders so many samples and ends.
-_SAMPLES_PER_JOB = 1024
+SAMPLES_PER_JOB = 1024
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def _plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
     jobs, shards = [], _shards(spec, missing)
     for scene in range(len(spec.scenes)):
         mine = [shard for shard in shards if shard.scene == scene]
-        most = max(1, min(_SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))
+        most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))
         points = points_name(scene) in missing
         # Shards of evaluated splits cost more: deal them out.
         count = -(-len(mine) // most)

@@ -6,7 +6,7 @@ import json
 import os
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -115,24 +115,41 @@ def missing_files(directory: AnyPath, spec: DatasetSpec) -> list[str]:
     return [name for name in dataset_files(spec) if name not in there]
 
 
-def check_dataset(directory: AnyPath, spec: DatasetSpec) -> Mapping[str, Any]:
-    """The manifest of a complete dataset.
+def read_manifest(directory: AnyPath) -> dict[str, Any]:
+    """What a dataset's manifest says.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    path = directory / MANIFEST
+    advice = "run `nlt generate` with the same --config files"
+    try:
+        return dict(json.loads(path.read_text()))
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"{directory}: no dataset here; {advice}, it prints the directory that it fills") from None
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path}: damaged manifest ({error}); delete it and {advice}") from None
+
+
+def read_spec(directory: AnyPath) -> DatasetSpec:
+    """The spec in a dataset's manifest."""
+    try:
+        return DatasetSpec(**read_manifest(directory)["spec"])
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{directory / MANIFEST}: spec: not one of this version ({error}); generate it again") from None
+
+
+def check_dataset(directory: AnyPath, spec: DatasetSpec) -> None:
+    """Refuse anything but a complete dataset of `spec`.
 
     Raises:
         UserError: it is missing, incomplete, or holds something else than `spec` asks for.
     """
-    path = directory / MANIFEST
-    advice = "run `nlt generate` with the same --config files"
-    if not path.exists():
-        raise UserError(f"{directory}: no dataset here; {advice}")
-    try:
-        manifest = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}: damaged manifest ({error}); delete it and {advice}") from None
+    manifest, advice = read_manifest(directory), "run `nlt generate` with the same --config files"
     for key, value in spec.manifest.items():
         if key != "nlt" and manifest.get(key) != value:
-            raise UserError(f"{path}: {key}: is not what the config asks for; delete {directory} and {advice}")
+            place = directory / MANIFEST
+            raise UserError(f"{place}: {key}: is not what the config asks for; delete {directory} and {advice}")
     missing = missing_files(directory, spec)
     if missing:
         raise UserError(f"{directory}: incomplete, {len(missing)} files missing, such as {missing[0]}; {advice}")
-    return manifest

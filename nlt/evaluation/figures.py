@@ -84,13 +84,13 @@ def draw_sample(path: Path, sample: Batch) -> None:
         "(3) depth": (sample["depth"] / sample["depth"].amax())[0, 0],
         "(4) normal": sample["normal"][0].permute(1, 2, 0) / 2 + 0.5,
         "(5) albedo": sample["albedo"][0].permute(1, 2, 0),
-        "(6) points in view": _scatter(in_view, albedo, height, width),
-        "(7) without occluded points": _scatter(kept, albedo, height, width),
+        "(6) point cloud": _scatter(in_view, albedo, height, width),
+        "(7) point cloud, occluded points masked": _scatter(kept, albedo, height, width),
     }
     clouds: dict[str, tuple[Tensor, Tensor]] = {
-        "(8) visibility": (points, torch.tensor([[1, 0.9, 0], [0.3, 0.2, 0.5]])[visible.long()]),
-        "(9) point albedo": (points[visible], albedo[visible]),
-        "(10) point emission": (points[visible], emission[visible].clamp(min=0.3)),
+        "(8) per-point visibility": (points, torch.tensor([[1, 0.9, 0], [0.3, 0.2, 0.5]])[visible.long()]),
+        "(9) per-point albedo": (points[visible], albedo[visible]),
+        "(10) per-point emission": (points[visible], emission[visible].clamp(min=0.3)),
         "(11) photon origins": (sample["photon_origin"][0], colour),
         "(12) photon hits": (hits, colour[valid]),
     }  # fmt: skip
