@@ -20,7 +20,7 @@ from torch.utils.data import default_collate
 
 from nlt import paths, training
 from nlt.cli import main
-from nlt.data.datamodule import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock, compare
 from nlt.models.module import RenderingModule

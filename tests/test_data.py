@@ -11,7 +11,8 @@ from conftest import write_yaml
 from generated import SIZE, content, spec_of
 
 from nlt.data import store
-from nlt.data.datamodule import EpochSampler, LightTransportDataModule, LightTransportDataset
+from nlt.data.datamodule import LightTransportDataModule
+from nlt.data.dataset import EpochSampler, LightTransportDataset
 from nlt.data.generate import generate
 from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, default_collate
 
 from nlt.baselines.cnn import CNN
 from nlt.cli import main
-from nlt.data.datamodule import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import write_shard
 from nlt.metrics.quantities import METRICS

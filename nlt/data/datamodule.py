@@ -2,115 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from typing import Any
 
 import lightning as L
-import numpy as np
 import torch
-from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Sampler
 
+from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler
+from nlt.data.engines import cores
 from nlt.data.files import AnyPath
-from nlt.data.sample import BATCH_FIELDS
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import ShardReader, check_dataset, points_name, read_points
+from nlt.data.store import check_dataset
 from nlt.errors import UserError
-from nlt.scenes.camera import Camera
-
-_TARGETS = {"train": ("noisy",), "val": ("noisy", "reference_a", "reference_b")}
-_TARGETS["test"] = _TARGETS["val"]
-
-
-class LightTransportDataset(Dataset[dict[str, Tensor]]):
-    """The samples of one split, as the fields of `FIELDS` and `BATCH_FIELDS` that `inputs` names.
-
-    Args:
-        directory: of the dataset.
-        spec: what it holds.
-        split: train, val or test.
-        inputs: fields that the method reads; None for all. The split's target fields come along.
-    """
-
-    def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
-        self.directory, self.spec, self.split = directory, spec, split
-        self._reader = ShardReader()
-        self._points = [read_points(directory / points_name(k)) for k in range(len(spec.scenes))]
-        stored = spec.fields(split)
-        self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
-        needed = set(stored) if self._wanted is None else self._wanted & set(stored)
-        if self._wants("view_direction"):
-            needed |= {"camera_matrix", "world_to_view"}
-        if any(self._wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
-            needed |= {"translation", "present"}
-        self._stored = [name for name in stored if name in needed]
-
-    def _wants(self, name: str) -> bool:
-        return self._wanted is None or name in self._wanted
-
-    def __len__(self) -> int:
-        return len(self.spec.scenes) * self.spec.count(self.split)
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """One sample; floats are float32."""
-        scene, row = divmod(index, self.spec.count(self.split))
-        shard = self.spec.shard(self.split, scene, row)
-        stored = self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
-        sample = {name: _tensor(array) for name, array in stored.items()}
-        if self._wants("view_direction"):
-            size = self.spec.resolution
-            camera = Camera(stored["camera_matrix"], stored["world_to_view"], size, size)
-            sample["view_direction"] = torch.from_numpy(camera.view_directions())
-        sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self._wants(k)}
-        sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)
-        sample["exposure"] = torch.tensor(self.spec.descriptions[scene].exposure, dtype=torch.float32)
-        return sample
-
-    def _point_fields(self, scene: int, stored: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        """The static points, moved and hidden as the sample's state says (supplementary, Sec. Datasets)."""
-        if "present" not in stored:
-            return {}
-        points = self._points[scene]
-        # Row -1, for what never moves, stays where it is.
-        translation = np.concatenate([stored["translation"], np.zeros((1, 3), np.float32)])
-        present = np.concatenate([stored["present"], [True]])
-        return {
-            "point_position": torch.from_numpy(points["position"] + translation[points["object"]]),
-            "point_visible": torch.from_numpy(present[points["object"]]),
-            "point_material": torch.from_numpy(points["material"].astype(np.int64)),
-            "point_albedo": torch.from_numpy(points["albedo"]),
-            "point_emission": torch.from_numpy(points["emission"]),
-        }
-
-
-def _tensor(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float16 else np.array(array))
-
-
-class EpochSampler(Sampler[int]):
-    """This process's part of the dataset: shuffled by (seed, epoch) alone, so that a resumed run continues it.
-
-    While training, every process gets equally many samples and what is left over is dropped; at evaluation,
-    each sample is seen once by exactly one process.
-    """
-
-    def __init__(self, length: int, rank: int, processes: int, shuffle: bool, seed: int) -> None:
-        self.length, self.rank, self.processes, self.shuffle, self.seed = length, rank, processes, shuffle, seed
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning before each epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        if self.shuffle:
-            return self.length // self.processes
-        return len(range(self.rank, self.length, self.processes))
-
-    def __iter__(self) -> Iterator[int]:
-        order = np.arange(self.length)
-        if self.shuffle:
-            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
-        return iter(order[self.rank :: self.processes][: len(self)].tolist())
 
 
 class LightTransportDataModule(L.LightningDataModule):
@@ -120,8 +23,10 @@ class LightTransportDataModule(L.LightningDataModule):
         dataset: what it holds; `nlt generate` makes it.
         root: directory or fsspec URL of datasets.
         batch_size: samples per step and process (paper: 32, static scenes 128).
-        workers: processes that load.
-        seed: of the shuffling.
+        workers: processes that load, or render.
+        seed: of the shuffling; online, of which samples there are.
+        online: render the training samples while training, each for one step alone, and store none. An epoch is
+            as many as `dataset.train` says; validation and test samples are generated and stored as ever.
     """
 
     def __init__(
@@ -131,12 +36,30 @@ class LightTransportDataModule(L.LightningDataModule):
         batch_size: int = 32,
         workers: int = 1,
         seed: int = 0,
+        online: bool = False,
     ) -> None:
         super().__init__()
+        if online and workers < 1:
+            raise UserError(f"data.workers: must be at least 1, is {workers}: with data.online, they render")
         if batch_size < 1:
             raise UserError(f"data.batch_size: must be at least 1, is {batch_size}")
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
+        self.online, self.passes = online, 0
+        self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
+
+    def next_pass(self) -> int:
+        """Which pass over the online samples begins; each comes once."""
+        self.passes += 1
+        return self.passes - 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """For checkpoints: how many passes over online samples were begun; a resumed run goes on behind them."""
+        return {"passes": self.passes} if self.online else {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on where a checkpoint's run was."""
+        self.passes = state_dict.get("passes", 0)
 
     @property
     def num_scenes(self) -> int:
@@ -155,15 +78,22 @@ class LightTransportDataModule(L.LightningDataModule):
             UserError: the dataset is missing, incomplete, or another one.
         """
         if self.directory is None:
-            directory = self.spec.directory(self.root)
-            check_dataset(directory, self.spec)
+            directory = self.stored.directory(self.root)
+            check_dataset(directory, self.stored)
             self.directory = directory
 
     def split(self, name: str) -> LightTransportDataset:
         """The dataset of a split, with the fields that the trainer's method needs; all without a trainer."""
         assert self.directory is not None, "call setup first"
         module = getattr(self.trainer, "lightning_module", None)
-        return LightTransportDataset(self.directory, self.spec, name, getattr(module, "inputs", None))
+        inputs = getattr(module, "inputs", None)
+        if self.online and name == "train":
+            from nlt.data.online import OnlineDataset  # which needs Mitsuba
+
+            devices = self.trainer.num_devices if self.trainer else 1
+            threads = max(1, cores() // (self.workers * devices))
+            return OnlineDataset(self.directory, self.stored, inputs, self.num_scenes * self.spec.train, threads)
+        return LightTransportDataset(self.directory, self.stored, name, inputs)
 
     def _loader(self, name: str) -> DataLoader:
         dataset, training = self.split(name), name == "train"
@@ -172,12 +102,18 @@ class LightTransportDataModule(L.LightningDataModule):
             raise UserError(f"data.dataset.{name}: is 0; this command needs {name} samples")
         if training and len(dataset) // processes < self.batch_size:
             raise UserError(f"data.batch_size: {self.batch_size} is more than the {len(dataset)} training samples")
+        online = training and self.online
+        sampler: Sampler[int] = EpochSampler(len(dataset), rank, processes, training, self.seed)
+        if online:
+            sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            sampler=EpochSampler(len(dataset), rank, processes, training, self.seed),
+            sampler=sampler,
             drop_last=training,
             num_workers=self.workers,
+            # Rendering starts threads, which a fork would lose. No leak: the memory of one scene's renderer stays.
+            multiprocessing_context="spawn" if online else None,
             persistent_workers=self.workers > 0,
             pin_memory=torch.cuda.is_available(),
         )

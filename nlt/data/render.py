@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,7 @@ class SampleRenderer:
         self.scene = Scene(self.description, spec.experiment)
         self.renderer = Renderer(self.scene)
         self._states: dict[str, Any] | None = None
+        self._taken: set[bytes] = set()  # states of the evaluated splits
         if threads:
             dr.set_thread_count(threads)  # not earlier: with one thread, loading a scene waits for ever
 
@@ -37,41 +39,54 @@ class SampleRenderer:
         return sample_points(self.scene, self.spec.points, self.spec.seed)
 
     def place(self, split: str, index: int, rest: bool = False) -> Camera:
-        """Put the scene into the state of a sample and return the sample's camera."""
+        """Put the scene into the state of a sample and return the sample's camera.
+
+        Training samples go on after the last one that the spec counts, in states that val and test do not have.
+        """
         spec = self.spec
         if rest:
             state = rest_state(self.description, spec.experiment)
         else:
-            self._states = self._states or spec.states(self.index)
-            state = self._states[split][index]
+            if self._states is None:
+                self._states = spec.states(self.index)
+                self._taken = {state.key for name in ("val", "test") for state in self._states[name]}
+            listed = self._states[split]
+            state = listed[index] if index < len(listed) else spec.state(split, self.index, index, self._taken)
         self.scene.set_state(state)
         rng = np.random.default_rng(spec.seeds(split, self.index, index).spawn(2)[1])
         return sample_view(self.description, spec.resolution, rng)
 
-    def sample(self, split: str, index: int, rest: bool = False) -> dict[str, np.ndarray]:
-        """One sample, all fields of its split. `rest`: in the rest state, for trying out the speed."""
+    def sample(
+        self, split: str, index: int, rest: bool = False, only: Collection[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """One sample, all fields of its split or `only` some. `rest`: in the rest state, for trying out the speed."""
         spec = self.spec
         camera = self.place(split, index, rest)
         state = self.scene.state
         seeds = spec.seeds(split, self.index, index).generate_state(5)
         noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds)
-        fields, sizes = spec.fields(split), spec.sizes
+        sizes = spec.sizes
+        fields = {name: f for name, f in spec.fields(split).items() if only is None or name in only}
         moved = np.zeros((sizes["M"], 3), np.float32)
         present = np.zeros(sizes["M"], bool)
         moved[: len(state.present)], present[: len(state.present)] = state.translation, state.present
         sample: dict[str, np.ndarray] = {
-            "noisy": self._radiance(camera, spec.noisy_spp, noisy),
-            "noisy_input": self._radiance(camera, spec.input_spp, noisy_input),
-            **self.renderer.gbuffer(camera),
-            **self.renderer.photons(spec.photons, photons),
             "camera_matrix": camera.matrix,
             "world_to_view": camera.world_to_view,
             "translation": moved,
             "present": present,
         }
-        if "reference_a" in fields:
-            sample["reference_a"] = self._radiance(camera, spec.reference_spp, half_a)
-            sample["reference_b"] = self._radiance(camera, spec.reference_spp, half_b)
+        images = {
+            "noisy": (spec.noisy_spp, noisy),
+            "noisy_input": (spec.input_spp, noisy_input),
+            "reference_a": (spec.reference_spp, half_a),
+            "reference_b": (spec.reference_spp, half_b),
+        }
+        sample |= {name: self._radiance(camera, *image) for name, image in images.items() if name in fields}
+        if not fields.keys().isdisjoint(("depth", "normal", "albedo")):
+            sample |= self.renderer.gbuffer(camera)
+        if any(name.startswith("photon_") for name in fields):
+            sample |= self.renderer.photons(spec.photons, photons)
         return {
             name: np.ascontiguousarray(sample[name], field.dtype).reshape(field.resolve(sizes))
             for name, field in fields.items()

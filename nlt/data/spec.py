@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from nlt.scenes.state import SceneState, sample_state
 FORMAT = 1  # of the files on disk
 # Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
 SECTIONS = ("data", "model", "trainer", "seed_everything")
-DATA = ("dataset", "root", "batch_size", "workers", "seed")
+DATA = ("dataset", "root", "batch_size", "workers", "seed", "online")
 _DRAWS = 1000  # of a state that no other split has
 
 
@@ -35,7 +35,7 @@ class DatasetSpec:
         scenes: names in configs/scenes, or paths of scene.yaml files.
         experiment: static, fixed_lights (Table 1) or moving_lights (Table 2).
         resolution: height and width of the images in pixels.
-        train: training samples per scene.
+        train: training samples per scene; of online training, in an epoch.
         val: validation samples per scene.
         test: test samples per scene.
         points: surface points per scene.
@@ -67,7 +67,7 @@ class DatasetSpec:
             raise UserError(f"{at}.scenes: must be a list of scene names, is {self.scenes!r}")
         if self.experiment not in EXPERIMENTS:
             raise UserError(f"{at}.experiment: must be one of {', '.join(EXPERIMENTS)}, is {self.experiment!r}")
-        least = {"resolution": 8, "seed": 0, "val": 0, "test": 0}
+        least = {"resolution": 8, "seed": 0, **dict.fromkeys(SPLITS, 0)}
         for field in dataclasses.fields(self)[2:]:
             value, low = getattr(self, field.name), least.get(field.name, 1)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
@@ -118,6 +118,10 @@ class DatasetSpec:
         names = "+".join(d.name for d in self.descriptions[:4])
         return open_path(root) / f"{self.experiment}-{names}-{self.resolution}-{digest}"
 
+    def without_train(self) -> DatasetSpec:
+        """What online training stores of it: its samples for validation and test, and its points."""
+        return dataclasses.replace(self, train=0)
+
     def shards(self) -> list[Shard]:
         """Every shard of the dataset, the evaluated splits first."""
         return [
@@ -138,23 +142,23 @@ class DatasetSpec:
 
     def states(self, scene: int) -> dict[str, list[SceneState]]:
         """The state of every sample of a scene. No state is in two splits, unless nothing can move."""
-        description = self.descriptions[scene]
-        taken: dict[bytes, str] = {}
+        taken: set[bytes] = set()
         states: dict[str, list[SceneState]] = {}
         for split in reversed(SPLITS):
-            states[split] = []
-            for index in range(self.count(split)):
-                rng = np.random.default_rng(self.seeds(split, scene, index).spawn(1)[0])
-                state = sample_state(description, self.experiment, rng)
-                # With every object removed, two states are equal.
-                for _ in range(_DRAWS):
-                    if not len(state.present) or taken.setdefault(state.key, split) == split:
-                        break
-                    state = sample_state(description, self.experiment, rng)
-                else:
-                    raise UserError(f"{description.file}: objects: too few states for three splits; widen a box")
-                states[split].append(state)
+            states[split] = [self.state(split, scene, index, taken) for index in range(self.count(split))]
+            taken |= {state.key for state in states[split]}
         return states
+
+    def state(self, split: str, scene: int, index: int, taken: Collection[bytes]) -> SceneState:
+        """The state of one sample, of whatever index, that is none of those `taken` by other splits."""
+        description = self.descriptions[scene]
+        rng = np.random.default_rng(self.seeds(split, scene, index).spawn(1)[0])
+        # With every object removed, two states are equal.
+        for _ in range(_DRAWS):
+            state = sample_state(description, self.experiment, rng)
+            if not len(state.present) or state.key not in taken:
+                return state
+        raise UserError(f"{description.file}: objects: too few states for three splits; widen a box")
 
 
 @dataclass(frozen=True)
@@ -201,7 +205,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
-    """The dataset that config files describe, and the root directory of datasets."""
+    """The dataset that config files describe, without what is rendered online; the root directory of datasets."""
     where = " + ".join(files)
     merged = read_configs(files)
     data = merged.get("data")
@@ -215,4 +219,7 @@ def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
                 raise UserError(f"{where}: {section}{key}: unknown key; known are {', '.join(known)}")
     if "scenes" not in data["dataset"]:
         raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
-    return DatasetSpec(**data["dataset"]), open_path(data.get("root", "datasets"))
+    spec, online = DatasetSpec(**data["dataset"]), data.get("online", False)
+    if not isinstance(online, bool):
+        raise UserError(f"{where}: data.online: must be true or false, is {online!r}")
+    return spec.without_train() if online else spec, open_path(data.get("root", "datasets"))

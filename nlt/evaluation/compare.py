@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from nlt import training
-from nlt.data.datamodule import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.generate import generate
 from nlt.data.spec import load_spec, read_configs

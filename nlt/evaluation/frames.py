@@ -7,7 +7,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from nlt.data.datamodule import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.camera import Camera

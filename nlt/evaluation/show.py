@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torch.utils.data import default_collate
 
-from nlt.data.datamodule import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import open_path
 from nlt.data.store import read_spec
 from nlt.errors import UserError

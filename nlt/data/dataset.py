@@ -1,0 +1,129 @@
+"""The samples of a split as tensors, and in which order they come. Light to import: rendering processes do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from nlt.data.files import AnyPath
+from nlt.data.sample import BATCH_FIELDS
+from nlt.data.spec import DatasetSpec
+from nlt.data.store import ShardReader, points_name, read_points
+from nlt.scenes.camera import Camera
+
+_TARGETS = {"train": ("noisy",), "val": ("noisy", "reference_a", "reference_b")}
+_TARGETS["test"] = _TARGETS["val"]
+
+
+class LightTransportDataset(Dataset[dict[str, Tensor]]):
+    """The samples of one split, as the fields of `FIELDS` and `BATCH_FIELDS` that `inputs` names.
+
+    Args:
+        directory: of the dataset.
+        spec: what it holds.
+        split: train, val or test.
+        inputs: fields that the method reads; None for all. The split's target fields come along.
+    """
+
+    def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
+        self.directory, self.spec, self.split = directory, spec, split
+        self._reader = ShardReader()
+        self._points = [read_points(directory / points_name(k)) for k in range(len(spec.scenes))]
+        stored = spec.fields(split)
+        self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
+        needed = set(stored) if self._wanted is None else self._wanted & set(stored)
+        if self._wants("view_direction"):
+            needed |= {"camera_matrix", "world_to_view"}
+        if any(self._wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
+            needed |= {"translation", "present"}
+        self._stored = [name for name in stored if name in needed]
+
+    def _wants(self, name: str) -> bool:
+        return self._wanted is None or name in self._wanted
+
+    def __len__(self) -> int:
+        return len(self.spec.scenes) * self.spec.count(self.split)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """One sample; floats are float32."""
+        scene, row = divmod(index, self.spec.count(self.split))
+        shard = self.spec.shard(self.split, scene, row)
+        stored = self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
+        return self._tensors(scene, index, stored)
+
+    def _tensors(self, scene: int, index: int, stored: dict[str, np.ndarray]) -> dict[str, Tensor]:
+        sample = {name: _tensor(array) for name, array in stored.items()}
+        if self._wants("view_direction"):
+            size = self.spec.resolution
+            camera = Camera(stored["camera_matrix"], stored["world_to_view"], size, size)
+            sample["view_direction"] = torch.from_numpy(camera.view_directions())
+        sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self._wants(k)}
+        sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)
+        sample["exposure"] = torch.tensor(self.spec.descriptions[scene].exposure, dtype=torch.float32)
+        return sample
+
+    def _point_fields(self, scene: int, stored: dict[str, np.ndarray]) -> dict[str, Tensor]:
+        """The static points, moved and hidden as the sample's state says (supplementary, Sec. Datasets)."""
+        if "present" not in stored:
+            return {}
+        points = self._points[scene]
+        # Row -1, for what never moves, stays where it is.
+        translation = np.concatenate([stored["translation"], np.zeros((1, 3), np.float32)])
+        present = np.concatenate([stored["present"], [True]])
+        return {
+            "point_position": torch.from_numpy(points["position"] + translation[points["object"]]),
+            "point_visible": torch.from_numpy(present[points["object"]]),
+            "point_material": torch.from_numpy(points["material"].astype(np.int64)),
+            "point_albedo": torch.from_numpy(points["albedo"]),
+            "point_emission": torch.from_numpy(points["emission"]),
+        }
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float16 else np.array(array))
+
+
+class EpochSampler(Sampler[int]):
+    """This process's part of the dataset: shuffled by (seed, epoch) alone, so that a resumed run continues it.
+
+    While training, every process gets equally many samples and what is left over is dropped; at evaluation,
+    each sample is seen once by exactly one process.
+    """
+
+    def __init__(self, length: int, rank: int, processes: int, shuffle: bool, seed: int) -> None:
+        self.length, self.rank, self.processes, self.shuffle, self.seed = length, rank, processes, shuffle, seed
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        if self.shuffle:
+            return self.length // self.processes
+        return len(range(self.rank, self.length, self.processes))
+
+    def __iter__(self) -> Iterator[int]:
+        order = np.arange(self.length)
+        if self.shuffle:
+            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
+        return iter(order[self.rank :: self.processes][: len(self)].tolist())
+
+
+class OnlineSampler(EpochSampler):
+    """This process's part of an endless sequence of samples: each pass takes the next `length` numbers of it.
+
+    `next_pass` counts them, not Lightning's epochs: a run that ended within an epoch goes on with that one.
+    """
+
+    def __init__(self, length: int, rank: int, processes: int, seed: int, next_pass: Callable[[], int]) -> None:
+        super().__init__(length, rank, processes, shuffle=True, seed=seed)
+        self.next_pass = next_pass
+
+    def __iter__(self) -> Iterator[int]:
+        first = (self.seed << 32) + self.next_pass() * self.length  # no two seeds share a number
+        return iter(range(first + self.rank, first + self.length, self.processes)[: len(self)])
