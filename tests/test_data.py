@@ -73,7 +73,7 @@ def test_nothing_is_pickled(dataset):
 
 @pytest.mark.parametrize(
     "change",
-    [{"resolution": 0}, {"train": 0}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
+    [{"resolution": 0}, {"train": -1}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
      {"experiment": "moving"}, {"scenes": []}, {"scenes": "living_room"}, {"reference_spp": True}],
     ids=str,
 )  # fmt: skip
