@@ -28,7 +28,7 @@ class SampleRenderer:
         self.spec, self.index = spec, scene
         self.description = spec.descriptions[scene]
         self.scene = Scene(self.description, spec.experiment)
-        self.renderer = Renderer(self.scene)
+        self.renderer = Renderer(self.scene, spec.teacher)
         self._states: dict[str, Any] | None = None
         self._taken: set[bytes] = set()  # states of the evaluated splits
         if threads:

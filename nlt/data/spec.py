@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import yaml
@@ -25,6 +25,7 @@ FORMAT = 1  # of the files on disk
 SECTIONS = ("data", "model", "trainer", "seed_everything")
 DATA = ("dataset", "root", "batch_size", "workers", "seed", "online")
 _DRAWS = 1000  # of a state that no other split has
+Teacher = Literal["scene", "path", "bdpt"]
 
 
 @dataclass
@@ -45,6 +46,7 @@ class DatasetSpec:
         reference_spp: samples per pixel of each of the reference's two halves.
         seed: of everything random in it.
         shard_size: samples per file.
+        teacher: the integrator of noisy, noisy_input and reference; "scene": the one that scene.yaml names.
     """
 
     scenes: list[str]
@@ -60,6 +62,7 @@ class DatasetSpec:
     reference_spp: int = 64
     seed: int = 0
     shard_size: int = 64
+    teacher: Teacher = "scene"
 
     def __post_init__(self) -> None:
         at = "data.dataset"
@@ -67,8 +70,10 @@ class DatasetSpec:
             raise UserError(f"{at}.scenes: must be a list of scene names, is {self.scenes!r}")
         if self.experiment not in EXPERIMENTS:
             raise UserError(f"{at}.experiment: must be one of {', '.join(EXPERIMENTS)}, is {self.experiment!r}")
+        if self.teacher not in get_args(Teacher):
+            raise UserError(f"{at}.teacher: must be one of {', '.join(get_args(Teacher))}, is {self.teacher!r}")
         least = {"resolution": 8, "seed": 0, **dict.fromkeys(SPLITS, 0)}
-        for field in dataclasses.fields(self)[2:]:
+        for field in dataclasses.fields(self)[2:-1]:
             value, low = getattr(self, field.name), least.get(field.name, 1)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise UserError(f"{at}.{field.name}: must be a whole number of at least {low}, is {value!r}")

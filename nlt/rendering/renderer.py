@@ -5,6 +5,7 @@ Everything comes back as numpy arrays in metres, world coordinates and linear, u
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -12,10 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nlt.errors import UserError
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.lanes import is_jit, launch
 from nlt.scenes.pointcloud import diffuse_albedo
+
+log = logging.getLogger(__name__)
 
 # Lanes traced at once: bounds memory (about 1 kB a lane).
 _MAX_LANES = 1 << 20
@@ -23,22 +27,33 @@ _POWER_SAMPLES = 4096
 
 
 class Renderer:
-    """Traces rays through a scene in its current state (`scene.set_state`)."""
+    """Traces rays through a scene in its current state (`scene.set_state`).
 
-    def __init__(self, scene: Scene) -> None:
+    Args:
+        teacher: "path" or "bdpt", by which radiance is estimated; "scene": the one that scene.yaml names, where
+            Mitsuba's variant can run it. Both have the same expectation.
+
+    Raises:
+        UserError: the variant cannot run `teacher`.
+    """
+
+    def __init__(self, scene: Scene, teacher: str = "scene") -> None:
         self.scene = scene
+        self.teacher = _available(scene.description.teacher if teacher == "scene" else teacher, teacher == "scene")
         # Infinite depth with Russian roulette: a bound on the depth would bias the teacher.
-        self.integrator = mi.load_dict({"type": "path", "max_depth": -1})
+        self.integrator = mi.load_dict(
+            {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
+        )
         self.emitters = list(scene.mi_scene.emitters())
         freeze: Callable = dr.freeze if is_jit() else lambda kernel: kernel
         # A frozen kernel is traced once, not at every call: 6 ms instead of 300 ms for a 64x64 image at 1 spp.
-        self._radiance = freeze(_radiance)
+        self._radiance = freeze(_radiance if self.teacher == "path" else _bidirectional)
         self._gbuffer = freeze(_gbuffer)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._powers: dict[tuple[bool, ...], np.ndarray] = {}  # by scene.lit
 
     def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
-        """Path-traced radiance; traces the pixels asked for and no others.
+        """The teacher's radiance; traces the pixels asked for and no others.
 
         Args:
             pixels: (n,) flat indices, row by row; None for the whole image.
@@ -59,6 +74,9 @@ class Renderer:
         total = np.zeros((len(pixels), 3))
         batch = max(1, min(spp, _MAX_LANES // max(len(pixels), 1)))
         fixed = self._camera_values(camera)
+        if self.teacher == "bdpt":
+            fixed["image"] = mi.Vector3f(camera.width, camera.height, len(pixels))
+            dr.make_opaque(fixed["image"])
         for k, start in enumerate(range(0, spp, batch)):
             count = min(batch, spp - start)
             sampler = mi.load_dict({"type": "independent"})
@@ -67,9 +85,11 @@ class Renderer:
             sampler.seed(dr.opaque(mi.UInt32, sub_seed) if is_jit() else sub_seed, lanes if is_jit() else 1)
             corners = {"corner": ("Point2f", np.repeat(corner, count, axis=0))}
             fixed |= {"integrator": self.integrator, "sampler": sampler}
-            (values,) = launch(self._radiance, corners, **fixed)
+            values, *splats = launch(self._radiance, corners, **fixed)
             # Samples of a pixel lie side by side: summing them here is deterministic, an atomic add is not.
             total += values.reshape(len(pixels), count, 3).sum(1, dtype=np.float64)
+            for pixel, value in zip(splats[::2], splats[1::2], strict=True):
+                total += _splatted(pixel, value, camera.width * camera.height)[pixels] / len(pixels)
         return (total / spp).T.astype(np.float32)
 
     def _scalar_image(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
@@ -169,6 +189,21 @@ def _radiance(scene: Any, integrator: Any, sampler: Any, corner: Any, **camera: 
     return (mi.Color3f(dr.select(valid, value, 0)),)
 
 
+def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image: Any, **camera: Any) -> tuple:
+    from nlt.rendering.bdpt import Pinhole
+
+    ray = _ray(corner + sampler.next_2d(), **camera)
+    pinhole = Pinhole(**camera, width=image.x, height=image.y, pixels=image.z)
+    value, _, splats = integrator.trace(scene, sampler, ray, pinhole)
+    return (value, *(part for splat in splats for part in splat))
+
+
+def _splatted(pixel: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
+    """(count, 3) float64: sums of `value` (n, 3) by `pixel` (n,), in the order of the lanes."""
+    lit = value.any(1)
+    return np.stack([np.bincount(pixel[lit], channel, count) for channel in value[lit].T], 1)
+
+
 def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
     ray = _ray(position, **camera)
     interaction = scene.ray_intersect(ray)
@@ -181,6 +216,21 @@ def _photons(scene: Any, emitter: Any, u0: Any, u1: Any, u2: Any) -> tuple:
     ray, weight = emitter.sample_ray(mi.Float(0), u0, u1, u2)
     interaction = scene.ray_intersect(ray)
     return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid()
+
+
+def _available(teacher: str, replaceable: bool) -> str:
+    """The teacher that this variant runs: `teacher`, or `path` in its place."""
+    if teacher == "path":
+        return teacher
+    if is_jit():
+        # Only now, for its classes are those of the variant.
+        import nlt.rendering.bdpt  # noqa: F401
+
+        return teacher
+    if not replaceable:
+        raise UserError("data.dataset.teacher: bdpt needs Mitsuba's llvm or cuda; install LLVM, or use teacher: path")
+    log.warning("teacher: bdpt needs Mitsuba's llvm or cuda; using path, which has the same expectation")
+    return "path"
 
 
 def _any(valid: Any) -> bool:

@@ -22,7 +22,7 @@ from nlt.scenes.sources import scene_files
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
-Teacher = Literal["path"]
+Teacher = Literal["path", "bdpt"]
 TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that make the images to learn from
 # Material type of a surface, by the lobes of its BSDF; the index into this tuple is what is stored.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
