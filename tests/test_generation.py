@@ -11,6 +11,7 @@ from collections import namedtuple
 from contextlib import suppress
 from pathlib import Path
 
+import drjit as dr
 import fsspec
 import numpy as np
 import pytest
@@ -21,9 +22,11 @@ from remote import RemoteFileSystem
 from nlt.data import engines, files, store
 from nlt.data import generate as generation
 from nlt.data.generate import generate
+from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 from nlt.paths import PROJECT
+from nlt.scenes.lanes import is_jit
 
 # ---- determinism and interruption -----------------------------------------------------------------------
 
@@ -43,7 +46,8 @@ LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points"
 RUN = f"""if __name__ == "__main__":
     import sys
     from nlt.data import generate as generation
-    from nlt.data.spec import DatasetSpec
+    from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec
     generation._announce = lambda *_: None
     generation.generate(DatasetSpec(sys.argv[2:], **{LONG!r}), sys.argv[1], workers=2)
 """
@@ -133,6 +137,26 @@ def test_worker_killed_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_announce", lambda *_: None)
     with pytest.raises(UserError, match=r"living_room.*worker died twice"):
         generate(spec_of(), tmp_path, workers=1)
+
+
+# ---- nothing is compiled twice --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("experiment", ["static", "fixed_lights", "moving_lights"])
+def test_no_kernel_is_compiled_anew(experiment):
+    """By Dr.Jit's record: a new view, state or number of photons per emitter runs what the first sample compiled."""
+    if not is_jit():
+        pytest.skip("the scalar variant compiles nothing")
+    render = SampleRenderer(spec_of(experiment=experiment, train=8, test=2), 0)
+    compiled: set = set()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for split, index in [("test", 0), ("test", 1), *(("train", k) for k in range(8))]:
+            render.sample(split, index)
+            kernels = {k["hash"] for k in dr.kernel_history((dr.KernelType.JIT,))}
+            assert kernels and (not compiled or kernels <= compiled), (split, index)
+            compiled |= kernels
+            dr.kernel_history_clear()
 
 
 # ---- clusters -------------------------------------------------------------------------------------------

@@ -42,12 +42,27 @@ def launch(kernel: Callable, lanes: Mapping[str, tuple[str, np.ndarray]], **fixe
     count = len(next(iter(lanes.values()))[1])
     types = {name: getattr(mi, kind) for name, (kind, _) in lanes.items()}
     if is_jit():
-        values = {name: types[name](np.ascontiguousarray(array.T)) for name, (_, array) in lanes.items()}
+        values = {name: _upload(types[name], array) for name, (_, array) in lanes.items()}
         # An unevaluated array may be a literal, and literals are compiled into kernels.
         dr.make_opaque(values)
-        columns = [np.moveaxis(np.array(out), 0, -1) for out in kernel(**fixed, **values)]
-        # A value that is the same for all lanes comes back once.
-        return tuple(np.broadcast_to(column, (count, *column.shape[1:])) for column in columns)
+        results = kernel(**fixed, **values)
+        dr.eval(results)
+        return tuple(_download(result, count) for result in results)
     rows = zip(*(array.tolist() for _, array in lanes.values()), strict=True)
     results = [kernel(**fixed, **{n: t(v) for (n, t), v in zip(types.items(), row, strict=True)}) for row in rows]
     return tuple(np.array([np.array(value) for value in column]) for column in zip(*results, strict=True))
+
+
+# Component by component: Dr.Jit's own conversions of whole vectors compile a kernel for every number of lanes.
+
+
+def _upload(kind: Any, array: np.ndarray) -> Any:
+    columns = np.ascontiguousarray(array.T, np.float32)
+    return owned(columns) if array.ndim == 1 else kind(*map(owned, columns))
+
+
+def _download(value: Any, count: int) -> np.ndarray:
+    if dr.depth_v(value) > 1:
+        return np.stack([_download(component, count) for component in value], axis=-1)
+    # What is the same for all lanes comes back once.
+    return np.broadcast_to(np.array(value), count)
