@@ -102,7 +102,7 @@ class SceneDescription:
         """SHA-256 over everything the scene is made of: `scene.yaml`, the scene file and the files it names."""
         files = [self.file]
         if self.path is None:
-            files.append(Path(__file__).with_name("builtin.py"))
+            files += sorted(Path(__file__).with_name("builtin").glob("*.py"))
         else:
             files += scene_files(self.path)
         total = hashlib.sha256()
