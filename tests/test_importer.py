@@ -1,5 +1,6 @@
 """Scene files of every dialect become the same scene: against twins in Mitsuba 3's own words, and analytic values."""
 
+import json
 import re
 
 import mitsuba as mi
@@ -108,6 +109,23 @@ def picture(scene, spp=4):
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=1))
 
 
+def seen(scene, origin, target, spp=4096):
+    """Radiance (3,) that comes from `target` to `origin`."""
+    sensor = mi.load_dict(
+        {
+            "type": "perspective", "fov": 0.01, "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 2, "height": 2, "pixel_format": "rgb", "rfilter": {"type": "box"}},
+        }
+    )  # fmt: skip
+    return np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "path"}), spp=spp)).mean((0, 1))
+
+
+def under_white_sky(scene, x=0.0, y=0.0):
+    """Radiance (3,) that leaves (x, y, 0) along +z, under a sky of radiance one."""
+    lit = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, **{s.id(): s for s in scene.shapes()}})
+    return seen(lit, [x, y, 3], [x, y, 0])
+
+
 def test_old_dialect_renders_as_its_twin(folder):
     old = importer.read(write(folder / "old.xml", OLD))
     assert [s.id() for s in old.scene.shapes()] == ["Mesh001", "Quad", "Quad_2"]
@@ -190,11 +208,10 @@ def test_mixture_keeps_its_weights(tmp_path):
         f'<bsdf type="diffuse"><rgb name="reflectance" value="{c}"/></bsdf>' for c in ("1 0 0", "0 1 0", "0 0 1")
     )
     mixed = f'<bsdf type="mixturebsdf"><string name="weights" value="0.5, 0.2, 0.3"/>{colours}</bsdf>'
-    xml = f'<scene version="0.6.0"><shape type="rectangle">{mixed}</shape><emitter type="constant"/></scene>'
-    scene = importer.load(write(tmp_path / "scene.xml", xml))
-    # Under a white sky a flat diffuse surface shows its albedo.
-    pixel = np.array(picture(scene, spp=4096))[8:10, 6:9].reshape(-1, 3).mean(0)
-    np.testing.assert_allclose(pixel, [0.5, 0.2, 0.3], atol=0.01)
+    xml = f'<scene version="0.6.0"><shape type="rectangle">{mixed}</shape></scene>'
+    np.testing.assert_allclose(
+        under_white_sky(importer.load(write(tmp_path / "scene.xml", xml))), [0.5, 0.2, 0.3], atol=1e-3
+    )
 
 
 ANALYTIC = {
@@ -290,15 +307,7 @@ def test_point_light_becomes_a_small_lamp(tmp_path):
         <transform name="toWorld"><scale value="0.01"/></transform></shape>
         <emitter type="point"><point name="position" z="2"/><rgb name="intensity" value="8, 4, 2"/></emitter></scene>"""
     scene = importer.load(write(tmp_path / "scene.xml", xml))
-    sensor = mi.load_dict(
-        {
-            "type": "perspective", "fov": 0.1,
-            "to_world": mi.ScalarTransform4f().look_at([1, 0, 2], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb"},
-        }
-    )  # fmt: skip
-    pixel = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "direct"}), spp=256)).mean((0, 1))
-    np.testing.assert_allclose(pixel, np.array([8, 4, 2]) / 4 / np.pi, rtol=0.02)
+    np.testing.assert_allclose(seen(scene, [1, 0, 2], [0, 0, 0]), np.array([8, 4, 2]) / 4 / np.pi, rtol=0.02)
 
 
 def test_imported_scene_is_assembled(folder):
@@ -412,3 +421,218 @@ def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):
     assert ["far", "not here", "0", "no", "path"] in [re.split(r"  +", line) for line in lines]
     assert any(line.startswith("good") and "built in" in line for line in lines)
     assert any(line.startswith("broken") and "YAML" in line for line in lines)
+
+
+def write_gltf(path, materials, uv=None, **more):
+    """A unit quad in z = 0, facing +z, per material, 2 apart along x; `more` goes into the JSON."""
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], np.float32)
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]] if uv is None else uv, np.float32)
+    faces = np.array([0, 1, 2, 0, 2, 3], np.uint16)
+    blobs = [corners.tobytes(), uv.tobytes(), faces.tobytes()]
+    path.with_suffix(".bin").write_bytes(b"".join(blobs))
+    starts = np.cumsum([0, *map(len, blobs)]).tolist()
+    header = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(len(materials)))}],
+        "nodes": [{"name": f"quad.{k}", "mesh": k, "translation": [2 * k, 0, 0]} for k in range(len(materials))],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": k}]}
+                   for k in range(len(materials))],
+        "materials": materials,
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3",
+             "min": corners.min(0).tolist(), "max": corners.max(0).tolist()},
+            {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": a, "byteLength": len(b)}
+                        for a, b in zip(starts[:-1], blobs, strict=True)],
+        "buffers": [{"uri": path.with_suffix(".bin").name, "byteLength": starts[-1]}],
+    }  # fmt: skip
+    return write(path, json.dumps({**header, **more}))
+
+
+def test_gltf_diffuse_shows_its_albedo(tmp_path):
+    """Under a white sky: base colour times texture in linear light, row 0 of the image where v = 0."""
+    Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [188, 188, 188]]], np.uint8)).save(
+        tmp_path / "a b.png"
+    )
+    texture = {"index": 0}
+    turned = {"index": 0, "extensions": {"KHR_texture_transform": {"offset": [0.5, 0]}}}
+    rough = {"metallicFactor": 0, "roughnessFactor": 1}
+    materials = [
+        {"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.5, 0.8, 1], **rough}},
+        {"pbrMetallicRoughness": {"baseColorTexture": texture, "baseColorFactor": [0.5, 0.5, 0.5, 1], **rough}},
+        {"pbrMetallicRoughness": {"baseColorTexture": turned, **rough}},
+    ]
+    images = {
+        "images": [{"uri": "a%20b.png"}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"magFilter": 9728}],
+    }
+    path = write_gltf(tmp_path / "quads.gltf", materials, **images)
+    read = importer.read(path)
+    assert (
+        read.up == "y"
+        and read.warnings == ()
+        and [s.id() for s in read.scene.shapes()] == ["quad_0", "quad_1", "quad_2"]
+    )
+    np.testing.assert_allclose(under_white_sky(read.scene), [0.2, 0.5, 0.8], rtol=0.01)
+    grey = 0.5029  # 188 as linear light
+    for (x, y), colour in {(-1, 1): (1, 0, 0), (1, 1): (0, 1, 0), (-1, -1): (0, 0, 1), (1, -1): (grey,) * 3}.items():
+        near = under_white_sky(read.scene, 2 + x * 0.25, y * 0.25)
+        np.testing.assert_allclose(near, 0.5 * np.array(colour), atol=0.005)
+    np.testing.assert_allclose(under_white_sky(read.scene, 4 - 0.25, 0.25), [0, 1, 0], atol=0.01)
+
+
+GLTF = [
+    ({"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.4}}, "coated"),
+    ({"pbrMetallicRoughness": {"metallicFactor": 1, "roughnessFactor": 0.3}}, "glossy"),
+    ({"pbrMetallicRoughness": {"roughnessFactor": 0}}, "mirror"),
+    ({"pbrMetallicRoughness": {"metallicFactor": 0.5, "roughnessFactor": 0.5}}, "coated"),
+    ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}}}, "glass"),
+    ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1},
+                     "KHR_materials_volume": {"thicknessFactor": 1}, "KHR_materials_ior": {"ior": 1.3}}}, "glass"),
+    ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.5], "metallicFactor": 0}},
+     "diffuse"),
+]  # fmt: skip
+
+
+def test_gltf_materials(tmp_path):
+    scene = importer.load(write_gltf(tmp_path / "quads.gltf", [m for m, _ in GLTF]))
+    assert [material(s.bsdf()) for s in scene.shapes()] == [kind for _, kind in GLTF]
+
+
+def test_gltf_lights_and_warnings(tmp_path):
+    """Emission times its strength; a point light far away lights like I / d^2; what is lost is said."""
+    shine = {"KHR_materials_emissive_strength": {"emissiveStrength": 4.0}, "KHR_materials_clearcoat": {}}
+    glowing = {"emissiveFactor": [1, 0.5, 0.25], "extensions": shine, "normalTexture": {"index": 0}}
+    white = {"pbrMetallicRoughness": {"metallicFactor": 0}}
+    lights = [{"type": "point", "intensity": 8, "color": [1, 0.5, 0.25]}, {"type": "directional"}]
+    nodes = [
+        {"name": "glow", "mesh": 0, "rotation": [0, 1, 0, 0], "translation": [100, 0, 0]},
+        {"name": "lamps", "translation": [0, 0, 1], "children": [2]},
+        {"name": "bulb", "translation": [0, 0, 1], "extensions": {"KHR_lights_punctual": {"light": 0}}},
+        {"name": "floor", "mesh": 1, "scale": [0.01, 0.01, 0.01]},
+        {"name": "sun", "extensions": {"KHR_lights_punctual": {"light": 1}}},
+    ]
+    more = {
+        "extensions": {"KHR_lights_punctual": {"lights": lights}},
+        "nodes": nodes,
+        "scenes": [{"nodes": [0, 1, 3, 4]}],
+    }
+    read = importer.read(write_gltf(tmp_path / "lamps.gltf", [glowing, white], **more))
+    shapes = {s.id(): s for s in read.scene.shapes()}
+    assert set(shapes) == {"glow", "floor", "bulb"}
+    assert [w.split()[0] for w in read.warnings] == ["KHR_materials_clearcoat", "a", "normal"]
+    radiance = mi.traverse(shapes["glow"].emitter())["radiance.value"]
+    np.testing.assert_allclose(np.array(radiance).ravel(), [4, 2, 1])
+    np.testing.assert_allclose(seen(read.scene, [1, 0, 2], [0, 0, 0]), np.array([8, 4, 2]) / 4 / np.pi, rtol=0.02)
+
+
+def test_glb_of_trimesh(tmp_path):
+    """A GLB that another program wrote: node names, transforms and colours survive."""
+    scene = trimesh.Scene()
+    for name, x in (("seat", 0), ("back", 3)):
+        box = trimesh.creation.box((1, 2, 3))
+        pbr = trimesh.visual.material.PBRMaterial(
+            baseColorFactor=[255, 0, 0, 255], metallicFactor=0.0, roughnessFactor=1.0
+        )
+        box.visual = trimesh.visual.TextureVisuals(material=pbr)
+        scene.add_geometry(box, node_name=name, transform=trimesh.transformations.translation_matrix([x, 0, 0]))
+    (tmp_path / "chair.glb").write_bytes(scene.export(file_type="glb"))
+    shapes = {s.id(): s for s in importer.load(tmp_path / "chair.glb").shapes()}
+    assert set(shapes) == {"seat", "back"}
+    np.testing.assert_allclose(np.array(shapes["back"].bbox().min).ravel(), [2.5, -1, -1.5])
+    assert np.array(shapes["seat"].surface_area()).item() == pytest.approx(22)
+    np.testing.assert_allclose(under_white_sky(importer.load(tmp_path / "chair.glb")), [1, 0, 0], atol=0.01)
+
+
+OBJ = """mtllib my room.mtl
+o Table
+v -0.5 -0.5 0
+v 0.5 -0.5 0
+v 0.5 0.5 0
+v -0.5 0.5 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+vn 0 0 1
+usemtl Wood
+f 1/1/1 2/2/1 3/3/1 4/4/1
+usemtl Steel
+v 2 0 0
+v 3 0 0
+v 3 1 0
+f -3 -2 -1
+o Window
+usemtl Glass
+f 5//1 6//1 7//1
+g lamp
+usemtl Lamp
+f 5 6 7
+usemtl Ghost
+f 5 6 7
+"""
+MTL = """newmtl Wood
+Kd 0.8 0.8 0.8
+Ks 0 0 0
+map_Kd wood.png
+newmtl Steel
+Ks 0.9 0.9 0.9
+illum 3
+newmtl Glass
+Kd 0 0 0
+Ni 1.5
+d 0.1
+illum 4
+newmtl Lamp
+Ke 5 4 3
+"""
+
+
+def test_obj_and_mtl(tmp_path):
+    Image.fromarray(np.array([[[255, 0, 0]], [[0, 0, 255]]], np.uint8)).save(tmp_path / "wood.png")
+    path = write(tmp_path / "room.obj", OBJ)
+    write(tmp_path / "my room.mtl", MTL)
+    read = importer.read(path)
+    shapes = {s.id(): s for s in read.scene.shapes()}
+    kinds = {name: material(s.bsdf()) for name, s in shapes.items()}
+    assert kinds == {"Table": "diffuse", "Table_2": "mirror", "Window": "glass", "lamp": "diffuse", "lamp_2": "diffuse"}
+    assert [name for name, s in shapes.items() if s.is_emitter()] == ["lamp"]
+    assert np.array(shapes["Table"].surface_area()).item() == pytest.approx(1) and len(read.warnings) == 1
+    # OBJ's v grows upwards: the image's first row is at the top.
+    np.testing.assert_allclose(under_white_sky(read.scene, 0.1, 0.25), [1, 0, 0], atol=0.01)
+    np.testing.assert_allclose(under_white_sky(read.scene, 0.1, -0.25), [0, 0, 1], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fragments"),
+    [
+        ("a.gltf", "{}", ["not a glTF 2.0 file"]),
+        ("a.gltf", "words", ["not a glTF 2.0 file"]),
+        ("a.glb", "words", ["not a GLB file"]),
+        ("a.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "x.bin"}], "images": [{"uri": "y%20z.png"}]}',
+         ["missing: x.bin, y z.png"]),
+        ("a.gltf", '{"asset": {"version": "2.0"}, "scenes": [{"nodes": []}]}', ["no shapes"]),
+        ("a.obj", "mtllib no.mtl\nv 0 0 0\n", ["missing: no.mtl"]),
+        ("a.obj", "v 0 0 zero\n", ["not readable as OBJ"]),
+        ("a.obj", "v 0 0 0\nf 1 2 3\n", ["not readable as OBJ"]),
+        ("a.obj", "", ["no shapes"]),
+    ],
+)  # fmt: skip
+def test_unreadable_models_are_refused(tmp_path, name, content, fragments):
+    path = write(tmp_path / name, content)
+    refused(lambda: importer.load(path), path, *fragments)
+
+
+def test_digest_covers_buffers_and_images(tmp_path):
+    write_gltf(tmp_path / "quads.gltf", [{}])
+    digests = []
+    for content in (b"1", b"2"):
+        write(tmp_path / "room.obj", OBJ)
+        write(tmp_path / "my room.mtl", MTL)
+        (tmp_path / "wood.png").write_bytes(content)
+        (tmp_path / "quads.bin").write_bytes(content)
+        for source in ("room.obj", "quads.gltf"):
+            digests.append(load_description(str(write_yaml(tmp_path / "scene.yaml", source=source))).digest)
+    assert len(set(digests)) == 4

@@ -15,7 +15,9 @@ import numpy as np
 
 from nlt.errors import UserError
 from nlt.scenes import mitsuba_xml
-from nlt.scenes.meshes import Triangles, curved, live_mesh
+from nlt.scenes.meshes import bsdf, curved, emitter, live_mesh
+from nlt.scenes.mitsuba_xml import LAMP_RADIUS, unique
+from nlt.scenes.model import Material, Model, Triangles, named_files, read_gltf, read_obj
 
 SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 
@@ -48,7 +50,7 @@ def read(path: Path) -> Imported:
         raise UserError(f"{path}: {what}; give a file ending in {', '.join(SUFFIXES)}")
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: {suffix or 'no suffix'}: nlt reads scene files ending in {', '.join(SUFFIXES)}")
-    imported = _read_xml(path)
+    imported = _read_xml(path) if suffix == ".xml" else _read_model(path)
     if not imported.scene.shapes():
         raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in imported.warnings)}")
     return imported
@@ -74,8 +76,41 @@ def _read_xml(path: Path) -> Imported:
         camera = _matrix(document.sensor.find("transform"))
         axis = int(np.abs(camera[:3, 1]).argmax())
         up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
-    said = tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
-    return Imported(path, scene, said, camera, up)
+    return Imported(path, scene, _said(warnings), camera, up)
+
+
+def _read_model(path: Path) -> Imported:
+    check_missing(path, [name for name in named_files(path) if not (path.parent / name).is_file()])
+    is_obj = path.suffix.lower() == ".obj"
+    model = read_obj(path) if is_obj else read_gltf(path)
+    scene = _build(model)
+    return Imported(path, scene, _said(model.warnings), up=None if is_obj else "y")
+
+
+def _build(model: Model) -> Any:
+    """Live meshes of a model's parts, under their names, and a small sphere for every lamp."""
+    parts = list(model.parts)
+    for name, position, intensity in model.lamps:
+        ball = curved("sphere")
+        ball = Triangles(ball.vertices * LAMP_RADIUS + position, ball.faces, ball.normals, ball.uv)
+        radiance = tuple(intensity / (np.pi * LAMP_RADIUS**2))
+        parts.append((name, ball, Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
+    bsdfs: dict[int, Any] = {}  # one per material: each instance costs tracing time
+    meshes: dict[str, Any] = {}
+    for name, triangles, material in parts:
+        if len(triangles.faces) == 0:
+            continue
+        key = unique(re.sub(r"\W", "_", name), meshes)
+        if id(material) not in bsdfs:
+            bsdfs[id(material)] = mi.load_dict(bsdf(material))
+        light = emitter(material)
+        live = None if light is None else mi.load_dict(light)
+        meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], live)
+    return mi.load_dict({"type": "scene", **meshes})
+
+
+def _said(warnings: Counter[str]) -> tuple[str, ...]:
+    return tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
 
 
 class _Collect(mi.Appender):

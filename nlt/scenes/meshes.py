@@ -1,32 +1,23 @@
-"""Triangle meshes: live ones of Mitsuba from arrays, and the curved shapes of Mitsuba as triangles."""
+"""Live Mitsuba meshes, BSDFs and emitters from arrays, and the curved shapes of Mitsuba as triangles."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from PIL import Image
 
 from nlt.scenes.lanes import owned
+from nlt.scenes.model import Material, Triangles, linear
 
 _COLUMNS, _ROWS = 64, 32  # around and along a curved shape: a sphere's area is 0.3% short
 
 
-@dataclass(frozen=True)
-class Triangles:
-    """`vertices` (V, 3), `faces` (F, 3); `normals` (V, 3) and `uv` (V, 2) or None."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray | None = None
-    uv: np.ndarray | None = None
-
-
-def live_mesh(name: str, triangles: Triangles, bsdf: Any = None, emitter: Any = None) -> mi.Mesh:
-    """A mesh of the variant that is set; `bsdf` and `emitter` are live objects."""
+def live_mesh(name: str, triangles: Triangles, surface: Any = None, light: Any = None) -> mi.Mesh:
+    """A mesh of the variant that is set; `surface`, a BSDF, and `light`, an emitter, are live objects."""
     properties = mi.Properties()
-    for key, value in (("mesh_bsdf", bsdf), ("mesh_emitter", emitter)):
+    for key, value in (("mesh_bsdf", surface), ("mesh_emitter", light)):
         if value is not None:
             properties[key] = value
     mesh = mi.Mesh(
@@ -68,3 +59,77 @@ def curved(kind: str) -> Triangles:
     across = np.cross(b - a, c - a)
     faces = np.where((across * normals[faces].mean(1)).sum(1, keepdims=True) < 0, faces[:, ::-1], faces)
     return Triangles(vertices, faces[np.linalg.norm(across, axis=1) > 1e-9], normals, uv)
+
+
+def bsdf(material: Material) -> dict[str, Any]:
+    """The nearest BSDF of Mitsuba: diffuse, plastic, conductor or glass where it is one of these, else `principled`."""
+    colour = _texture(material.colour, material.image)
+    alpha = max(material.roughness**2, 1e-3)
+    smooth = material.roughness < 0.05
+    inner: dict[str, Any]
+    if material.transmission > 0.5:
+        tint = {"specular_transmittance": colour}
+        if material.thin:
+            return {"type": "thindielectric", "int_ior": material.ior, **tint}
+        if smooth:
+            return {"type": "dielectric", "int_ior": material.ior, **tint}
+        return {"type": "roughdielectric", "int_ior": material.ior, "alpha": alpha, **tint}
+    if material.rough_image is not None or 0.01 < material.metallic < 0.99:
+        inner = {
+            "type": "principled",
+            "base_color": colour,
+            "roughness": _channel(material.roughness, material.rough_image, 1),
+            "metallic": _channel(material.metallic, material.rough_image, 2),
+        }
+    elif material.metallic >= 0.99:
+        inner = {
+            "type": "conductor" if smooth else "roughconductor",
+            "material": "none",
+            "specular_reflectance": colour,
+        }
+        inner |= {} if smooth else {"alpha": alpha}
+    elif material.roughness > 0.9:
+        inner = {"type": "diffuse", "reflectance": colour}
+    else:
+        inner = {
+            "type": "plastic" if smooth else "roughplastic",
+            "diffuse_reflectance": colour,
+            "int_ior": material.ior,
+        }
+        inner |= {"nonlinear": True, **({} if smooth else {"alpha": alpha})}
+    inner = {"type": "twosided", "inner": inner}
+    if material.alpha < 1 or material.alpha_image is not None:
+        opacity = _channel(material.alpha, material.alpha_image, 0, material.cutoff)
+        return {"type": "mask", "opacity": opacity, "masked": inner}
+    return inner
+
+
+def emitter(material: Material) -> dict[str, Any] | None:
+    """Its area light, None where it does not shine."""
+    if not any(material.emission):
+        return None
+    return {"type": "area", "radiance": _texture(material.emission, material.emission_image)}
+
+
+def _texture(colour: tuple[float, ...], image: Image.Image | None) -> dict[str, Any]:
+    """A linear colour, times an sRGB image if there is one."""
+    if image is None:
+        return {"type": "rgb", "value": list(colour)}
+    pixels = np.asarray(image.convert("RGB"))
+    if all(c == 1 for c in colour):
+        return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.copy())}
+    table = linear(np.arange(256) / 255)
+    return _raw((table[pixels] * colour).astype(np.float32))
+
+
+def _channel(factor: float, image: Image.Image | None, band: int, cutoff: float | None = None) -> Any:
+    """A number, times one band of an image if there is one; 0 or 1 if there is a cutoff."""
+    if image is None:
+        return factor if cutoff is None else float(factor >= cutoff)
+    bands = np.asarray(image.convert("L") if len(image.getbands()) == 1 else image.convert("RGB"), np.float32) / 255
+    values = factor * (bands if bands.ndim == 2 else bands[..., band])
+    return _raw((values if cutoff is None else values >= cutoff).astype(np.float32)[..., None])
+
+
+def _raw(values: np.ndarray) -> dict[str, Any]:
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}

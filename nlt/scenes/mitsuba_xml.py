@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -26,7 +27,7 @@ ANALYTIC = ("sphere", "disk", "cylinder", "rectangle", "cube")  # shapes to be t
 _MESHES = ("obj", "ply", "serialized")
 _DROPPED = ("integrator", "film", "sampler", "rfilter", "medium", "subsurface", "phase", "volume")
 _ENVIRONMENTS = ("envmap", "constant", "sunsky", "timed_sunsky")
-_LAMP_RADIUS = 0.05  # scene units: of the small lamp that stands in for a point light
+LAMP_RADIUS = 0.05  # scene units: of the small lamp that stands in for a point light
 
 
 @dataclass
@@ -469,18 +470,18 @@ def _emitter(document: Document, parent: ET.Element, element: ET.Element) -> Non
             position.set("name", "center")
             lamp.append(position)
         if kind == "point":
-            ET.SubElement(lamp, "float", name="radius", value=str(_LAMP_RADIUS))
+            ET.SubElement(lamp, "float", name="radius", value=str(LAMP_RADIUS))
         else:
-            _transform(lamp).insert(0, ET.Element("scale", value=str(_LAMP_RADIUS)))
+            _transform(lamp).insert(0, ET.Element("scale", value=str(LAMP_RADIUS)))
         light = ET.SubElement(lamp, "emitter", type="area")
         intensity = _property(element, "intensity")
         values = re.split(r"[\s,]+", intensity.get("value", "1").strip()) if intensity is not None else ["1"]
-        radiance = [float(v.split(":")[-1]) / (np.pi * _LAMP_RADIUS**2) for v in values]
+        radiance = [float(v.split(":")[-1]) / (np.pi * LAMP_RADIUS**2) for v in values]
         ET.SubElement(light, "rgb", name="radiance", value=", ".join(f"{v:.6g}" for v in radiance))
         parent.remove(element)
         parent.append(lamp)
         document.warn(
-            f"a {kind} light is taken as a {lamp.get('type')} of radius {_LAMP_RADIUS:g} of the same intensity"
+            f"a {kind} light is taken as a {lamp.get('type')} of radius {LAMP_RADIUS:g} of the same intensity"
         )
     elif kind not in ("area", "directionalarea", *_ENVIRONMENTS):
         parent.remove(element)
@@ -525,7 +526,7 @@ def _one_environment(document: Document, root: ET.Element) -> None:
 
 def _name_shapes(root: ET.Element) -> None:
     """Every shape gets a unique id that stays the same: its own, else its file's or its kind's name, numbered."""
-    taken = {e.get("id") for e in root.iter() if e.get("id") and e.tag not in ("shape", "ref")}
+    taken = {e.get("id", "") for e in root.iter() if e.get("id") and e.tag not in ("shape", "ref")}
     shapes = root.findall("shape")
     shapes.sort(key=lambda s: s.get("id") is None)  # given ids come first
     for shape in shapes:
@@ -533,11 +534,14 @@ def _name_shapes(root: ET.Element) -> None:
         stem = Path(file.get("value", "")).stem if file is not None else shape.get("type", "")
         stem += f"_{part.get('value')}" if part is not None else ""
         base = re.sub(r"\W", "_", shape.get("id") or stem)
-        name, k = base, 2
-        while name in taken:
-            name, k = f"{base}_{k}", k + 1
+        name = unique(base, taken)
         taken.add(name)
         shape.set("id", name)
+
+
+def unique(name: str, taken: Container[str]) -> str:
+    """The name, numbered from 2 on if it is taken."""
+    return next(n for k in itertools.count(1) if (n := name if k == 1 else f"{name}_{k}") not in taken)
 
 
 def _locate(document: Document, root: ET.Element, folders: list[Path]) -> None:

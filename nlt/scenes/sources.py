@@ -9,4 +9,8 @@ from nlt.scenes import mitsuba_xml
 
 def scene_files(path: Path) -> list[Path]:
     """The file and every file that it names and that is there: meshes, images, includes."""
-    return sorted(set(mitsuba_xml.read(path).files))
+    if path.suffix.lower() == ".xml":
+        return sorted(set(mitsuba_xml.read(path).files))
+    from nlt.scenes.model import named_files  # here: it imports trimesh, which most scenes do not need
+
+    return sorted({path, *(f for name in named_files(path) if (f := path.parent / name).is_file())})

@@ -1,0 +1,352 @@
+"""Models of glTF, GLB and OBJ files as arrays: named parts with a triangle mesh and a material; no renderer needed."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from nlt.errors import UserError
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """`vertices` (V, 3), `faces` (F, 3); `normals` (V, 3) and `uv` (V, 2) or None; v = 0 is an image's top row."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    uv: np.ndarray | None = None
+
+
+@dataclass
+class Material:
+    """A metallic-roughness material (glTF 2.0, Appendix B), colours linear; images multiply what stands before them."""
+
+    colour: tuple[float, ...] = (0.8, 0.8, 0.8)
+    image: Image.Image | None = None
+    alpha: float = 1.0
+    alpha_image: Image.Image | None = None
+    cutoff: float | None = None  # below it a surface is not there, above it solid
+    metallic: float = 0.0
+    roughness: float = 1.0
+    rough_image: Image.Image | None = None  # roughness in green, metallic in blue
+    transmission: float = 0.0
+    thin: bool = True  # a sheet that does not bend light
+    ior: float = 1.5
+    emission: tuple[float, ...] = (0.0, 0.0, 0.0)
+    emission_image: Image.Image | None = None
+
+
+@dataclass
+class Model:
+    """`parts`: name -> mesh and material, in the file's order; `lamps`: position, intensity (W/sr) of point lights."""
+
+    parts: list[tuple[str, Triangles, Material]] = field(default_factory=list)
+    lamps: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
+    warnings: Counter[str] = field(default_factory=Counter)
+
+
+def named_files(path: Path) -> list[str]:
+    """The files that a model names, as it names them: buffers, images, materials."""
+    if path.suffix.lower() == ".obj":
+        libraries = [words for words in _lines(path) if words[0] == "mtllib"]
+        names = [" ".join(words[1:]) for words in libraries]
+        found = [path.parent / name for name in names]
+        inner = [words for f in found if f.is_file() for words in _lines(f) if words[0].lower() in _MAPS]
+        return [*names, *sorted({words[-1].replace("\\", "/") for words in inner})]
+    header, _ = _read_gltf(path)
+    uris = [part.get("uri", "") for key in ("buffers", "images") for part in header.get(key, [])]
+    return [unquote(uri) for uri in uris if uri and not uri.startswith("data:")]
+
+
+def read_gltf(path: Path) -> Model:
+    """A glTF 2.0 or GLB file: its default scene, transforms applied.
+
+    Raises:
+        UserError: it is no such file.
+    """
+    header, rest = _read_gltf(path)
+    model, materials = Model(), header.get("materials", [])
+    for k, material in enumerate(materials):
+        material["name"] = str(k)  # so that a loaded part says which material it has
+    for part in (*header.get("buffers", []), *header.get("images", [])):
+        if not part.get("uri", "data:").startswith("data:"):
+            part["uri"] = unquote(part["uri"])  # trimesh looks for a file of that name
+    try:
+        loaded = trimesh.load_scene(
+            io.BytesIO(_pack(header, rest)),
+            file_type="gltf" if rest is None else "glb",
+            resolver=trimesh.resolvers.FilePathResolver(str(path)),
+            process=False,
+        )
+    except Exception as error:  # trimesh raises whatever the broken part of a file leads to
+        raise UserError(f"{path}: not readable as glTF 2.0: {type(error).__name__}: {error}") from None
+    read = [_gltf_material(m, model) for m in materials]
+    for node in sorted(loaded.graph.nodes_geometry):
+        matrix, name = loaded.graph[node]
+        mesh = loaded.geometry[name]
+        if not isinstance(mesh, trimesh.Trimesh):
+            model.warnings[f"{node} is made of points or lines: left out"] += 1
+            continue
+        material, uv, source = Material((1.0, 1.0, 1.0)), None, None
+        if isinstance(mesh.visual, trimesh.visual.TextureVisuals):
+            if mesh.visual.uv is not None:
+                uv = np.asarray(mesh.visual.uv, float) * [1, -1] + [0, 1]
+            if (mesh.visual.material.name or "").isdigit():
+                source = int(mesh.visual.material.name)
+                material = read[source]
+                _images(material, mesh.visual.material)
+                if "baseColorTexture" in materials[source].get("pbrMetallicRoughness", {}) and material.image is None:
+                    model.warnings["an image that cannot be read is left out"] += 1
+        elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.kind == "vertex":
+            model.warnings["colours of vertices are left out: the mean is taken"] += 1
+            material.colour = tuple(linear(np.asarray(mesh.visual.vertex_colors)[:, :3].mean(0) / 255))
+        if uv is not None and source is not None:
+            uv = _texture_transform(materials[source], uv)
+        normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache.cache else None
+        model.parts.append((node, _placed(Triangles(mesh.vertices, mesh.faces, normals, uv), matrix), material))
+    _lamps(header, model)
+    return model
+
+
+def _placed(triangles: Triangles, matrix: np.ndarray) -> Triangles:
+    linear = matrix[:3, :3]
+    vertices = np.asarray(triangles.vertices, float) @ linear.T + matrix[:3, 3]
+    normals = triangles.normals
+    if normals is not None and abs(np.linalg.det(linear)) > 1e-20:
+        normals = normals @ np.linalg.inv(linear)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-20)
+    faces = np.asarray(triangles.faces)
+    return Triangles(vertices, faces if np.linalg.det(linear) >= 0 else faces[:, ::-1], normals, triangles.uv)
+
+
+def _read_gltf(path: Path) -> tuple[dict[str, Any], bytes | None]:
+    """The JSON, and what follows it in a GLB."""
+    data, rest = path.read_bytes(), None
+    if path.suffix.lower() == ".glb":
+        if data[:4] != b"glTF" or len(data) < 20:
+            raise UserError(f"{path}: not a GLB file: it does not start with glTF")
+        (length,) = struct.unpack("<I", data[12:16])
+        data, rest = data[20 : 20 + length], data[20 + length :]
+    try:
+        header = json.loads(data)
+        assert isinstance(header, dict) and header["asset"]["version"].startswith("2")
+    except (ValueError, AssertionError, LookupError, TypeError, AttributeError):
+        raise UserError(f"{path}: not a glTF 2.0 file") from None
+    return header, rest
+
+
+def _pack(header: dict[str, Any], rest: bytes | None) -> bytes:
+    text = json.dumps(header).encode()
+    if rest is None:
+        return text
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+
+
+def _gltf_material(data: dict[str, Any], model: Model) -> Material:
+    pbr, extensions = data.get("pbrMetallicRoughness", {}), data.get("extensions", {})
+    colour = pbr.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
+    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    mode = data.get("alphaMode", "OPAQUE")
+    known = ("ior", "emissive_strength", "transmission", "volume", "unlit")
+    for name in extensions:
+        if name.removeprefix("KHR_materials_") not in known:
+            model.warnings[f"{name} is left out"] += 1
+    if "normalTexture" in data:
+        model.warnings["normal maps are left out"] += 1
+    return Material(
+        colour=tuple(colour[:3]),
+        alpha=1.0 if mode == "OPAQUE" else colour[3],
+        cutoff=data.get("alphaCutoff", 0.5) if mode == "MASK" else None,
+        metallic=pbr.get("metallicFactor", 1.0),
+        roughness=pbr.get("roughnessFactor", 1.0),
+        transmission=extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0),
+        thin=not extensions.get("KHR_materials_volume", {}).get("thicknessFactor", 0.0),
+        ior=extensions.get("KHR_materials_ior", {}).get("ior", 1.5),
+        emission=tuple(strength * np.array(data.get("emissiveFactor", [0.0, 0.0, 0.0]))),
+    )
+
+
+def _images(material: Material, loaded: Any) -> None:
+    """The images that trimesh has read for a material."""
+    material.image, material.rough_image = loaded.baseColorTexture, loaded.metallicRoughnessTexture
+    material.emission_image = loaded.emissiveTexture
+    image = loaded.baseColorTexture
+    if image is not None and loaded.alphaMode in ("MASK", "BLEND") and "A" in image.getbands():
+        material.alpha_image = image.getchannel("A")
+
+
+def _texture_transform(material: dict[str, Any], uv: np.ndarray) -> np.ndarray:
+    """KHR_texture_transform of the base colour, for all of the material's textures."""
+    places = (material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), material.get("emissiveTexture"))
+    texture: dict[str, Any] = next((p for p in places if p), {})
+    move = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    angle = move.get("rotation", 0.0)
+    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return uv * move.get("scale", [1, 1]) @ turn.T + move.get("offset", [0, 0])
+
+
+def _lamps(header: dict[str, Any], model: Model) -> None:
+    """KHR_lights_punctual, in the units of the emissive factors."""
+    lights = header.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
+    for k, (node, matrix) in enumerate(_nodes(header)):
+        index = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
+        if index is None or index >= len(lights):
+            continue
+        light = lights[index]
+        kind, name = light.get("type"), node.get("name", light.get("name", f"light_{k}"))
+        if kind == "directional":
+            model.warnings["a directional light has no surface and no sky: left out"] += 1
+            continue
+        if kind == "spot":
+            model.warnings["a spot light is taken as a point light"] += 1
+        intensity = light.get("intensity", 1.0) * np.array(light.get("color", [1.0, 1.0, 1.0]))
+        model.lamps.append((name, matrix[:3, 3], intensity))
+
+
+def _nodes(header: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Every node of the default scene with its matrix (4, 4) to the world."""
+    nodes = header.get("nodes", [])
+    scenes = header.get("scenes") or [{"nodes": list(range(len(nodes)))}]
+    waiting = [(k, np.eye(4)) for k in scenes[header.get("scene", 0)].get("nodes", [])]
+    while waiting:
+        k, parent = waiting.pop(0)
+        node = nodes[k]
+        if "matrix" in node:
+            local = np.array(node["matrix"], float).reshape(4, 4).T
+        else:
+            x, y, z, w = node.get("rotation", [0, 0, 0, 1])
+            local = trimesh.transformations.quaternion_matrix([w, x, y, z])
+            local[:3, :3] *= node.get("scale", [1, 1, 1])
+            local[:3, 3] = node.get("translation", [0, 0, 0])
+        yield node, parent @ local
+        waiting += [(child, parent @ local) for child in node.get("children", [])]
+
+
+def linear(encoded: np.ndarray) -> np.ndarray:
+    """sRGB to linear, in [0, 1]."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+# Wavefront OBJ is read here: trimesh joins all parts of one material and loses the texture coordinates of quads.
+_MAPS = ("map_kd", "map_d", "map_ke")
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    """The words of every line that has any; a backslash goes on with the next line."""
+    text = path.read_text(errors="replace").replace("\\\n", " ")
+    return (words for line in text.splitlines() if (words := line.split("#")[0].split()))
+
+
+def read_obj(path: Path) -> Model:
+    """A Wavefront OBJ file with its materials: a part per object or group and material.
+
+    Raises:
+        UserError: a number or an index is broken.
+    """
+    model, materials = Model(), dict[str, Material]()
+    arrays: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    parts: dict[tuple[str, str], list[list[tuple[int, ...]]]] = {}
+    name, used = path.stem, ""
+    try:
+        for words in _lines(path):
+            match words[0]:
+                case "v" | "vt" | "vn":
+                    arrays[words[0]].append([float(w) for w in words[1 : 3 if words[0] == "vt" else 4]])
+                case "o" | "g" if len(words) > 1:
+                    name = "_".join(words[1:])
+                case "usemtl":
+                    used = " ".join(words[1:])
+                case "mtllib":
+                    materials |= _read_mtl(path.parent / " ".join(words[1:]), model)
+                case "f":
+                    corners = [_corner(w, arrays) for w in words[1:]]
+                    fan = [[corners[0], *corners[k : k + 2]] for k in range(1, len(corners) - 1)]
+                    parts.setdefault((name, used), []).extend(fan)
+        for (name, used), faces in parts.items():
+            if used not in materials:
+                model.warnings[f"material {used or '(none)'} is not in the MTL files: a grey one is taken"] += 1
+            model.parts.append((name, _triangles(faces, arrays), materials.get(used, Material())))
+    except (ValueError, IndexError) as error:
+        raise UserError(f"{path}: not readable as OBJ: {error}") from None
+    return model
+
+
+def _corner(word: str, arrays: dict[str, list[list[float]]]) -> tuple[int, ...]:
+    """Indices (v, vt, vn) from 0, -1 where there is none; negative ones in the file count from the end."""
+    fields = [*word.split("/"), "", ""][:3]
+    indices = []
+    for text, array in zip(fields, arrays.values(), strict=True):
+        index = int(text) if text else 0
+        indices.append(index - 1 if index > 0 else len(array) + index if index < 0 else -1)
+    return tuple(indices)
+
+
+def _triangles(faces: list[list[tuple[int, ...]]], arrays: dict[str, list[list[float]]]) -> Triangles:
+    corners = np.array(faces).reshape(-1, 3)
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    given = [np.array([array[k] for k in unique[:, c]]) if (unique[:, c] >= 0).all() else None
+             for c, array in enumerate(arrays.values())]  # fmt: skip
+    vertices, uv, normals = given
+    if vertices is None:
+        raise ValueError("a face without vertices")
+    # OBJ's v counts from the bottom row.
+    return Triangles(vertices, inverse.reshape(-1, 3), normals, None if uv is None else uv * [1, -1] + [0, 1])
+
+
+def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
+    materials: dict[str, Material] = {}
+    raw: dict[str, dict[str, list[str]]] = {}
+    for words in _lines(path):
+        if words[0] == "newmtl":
+            raw[" ".join(words[1:])] = current = {}
+        elif raw:
+            current[words[0].lower()] = words[1:]
+    for name, said in raw.items():
+        number = lambda key, default, said=said: [float(w) for w in said.get(key, [])[:3] if _is_number(w)] or default
+        opacity = number("d", [1 - number("tr", [0.0])[0]])[0]
+        illumination, shininess = int(number("illum", [2])[0]), number("ns", [0.0])[0]
+        shine = max(number("ks", [0.0]))
+        glass = illumination in (4, 6, 7, 9) and (opacity < 1 or max(number("kd", [0.8])) < 0.2)
+        mirror = illumination in (3, 5, 8) and not glass
+        material = Material(colour=tuple(number("kd", [0.8] * 3)), ior=number("ni", [1.5])[0], alpha=opacity)
+        if glass:
+            material.colour, material.alpha = (1.0, 1.0, 1.0), 1.0
+            material.transmission, material.thin, material.roughness = 1.0, False, 0.0
+        elif mirror:
+            material.colour, material.metallic = tuple(number("ks", [1.0] * 3)), 1.0
+            material.roughness = 0.0
+        elif shine > 0.01 and shininess > 1:
+            material.roughness = float((2 / (shininess + 2)) ** 0.25)  # the same width of the highlight
+        material.ior = material.ior if material.ior > 1.01 else 1.5
+        material.emission = tuple(number("ke", [0.0] * 3))
+        for key, attribute in (("map_kd", "image"), ("map_ke", "emission_image"), ("map_d", "alpha_image")):
+            if key in said:
+                image = Image.open(path.parent / said[key][-1].replace("\\", "/"))
+                setattr(material, attribute, image.convert("L") if key == "map_d" else image)
+        for key in set(said) & {"bump", "map_bump", "norm", "map_ks", "map_ns", "refl", "disp"}:
+            model.warnings[f"{key} of OBJ materials is left out"] += 1
+        if material.image is not None:
+            material.colour = (1.0, 1.0, 1.0)
+        materials[name] = material
+    return materials
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
