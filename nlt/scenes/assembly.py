@@ -17,6 +17,8 @@ from nlt.errors import UserError
 from nlt.scenes import importer
 from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
 from nlt.scenes.lanes import is_jit, owned
+from nlt.scenes.meshes import live_mesh
+from nlt.scenes.model import Triangles
 from nlt.scenes.state import SceneState, rest_state
 
 # A removed object shrinks to a speck of a micrometre: no ray meets it, and no kernel has to be compiled anew for
@@ -229,21 +231,9 @@ def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True)
 
 def _without_emitter(mesh: Any, shape: Shape) -> Any:
     """The same mesh, turned off: an emitter of zero radiance would still be sampled and add noise."""
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = shape.bsdf
     old = mi.traverse(mesh)
-    copy = mi.Mesh(
-        shape.id,
-        mesh.vertex_count(),
-        mesh.face_count(),
-        props=properties,
-        has_vertex_normals=mesh.has_vertex_normals(),
-        has_vertex_texcoords=mesh.has_vertex_texcoords(),
-    )
-    new = mi.traverse(copy)
-    for key in ("faces", "vertex_positions", "vertex_normals", "vertex_texcoords"):
-        if key in new and key in old:
-            new[key] = old[key]
-    new.update()
-    copy.set_id(shape.id)
-    return copy
+    column = lambda key, n: np.array(old[key]).reshape(-1, n)
+    normals = column("vertex_normals", 3) if mesh.has_vertex_normals() else None
+    uv = column("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None
+    triangles = Triangles(column("vertex_positions", 3), column("faces", 3), normals, uv)
+    return live_mesh(shape.id, triangles, shape.bsdf)

@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from nlt.scenes.lanes import owned
-from nlt.scenes.model import Material, Triangles, linear
+from nlt.scenes.mitsuba_xml import linear
+from nlt.scenes.model import Material, Triangles
 
 _COLUMNS, _ROWS = 64, 32  # around and along a curved shape: a sphere's area is 0.3% short
 

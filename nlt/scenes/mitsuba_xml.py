@@ -139,6 +139,11 @@ def _pop(element: ET.Element, name: str) -> ET.Element | None:
     return found
 
 
+def linear(encoded: np.ndarray) -> np.ndarray:
+    """sRGB to linear, both in [0, 1]."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
 def _number(element: ET.Element, name: str, default: float) -> float:
     found = _property(element, name)
     return default if found is None else _number_of(found, default)
@@ -269,9 +274,8 @@ def _values(document: Document, element: ET.Element) -> None:
             encoded = np.array([int(value[k : k + 2], 16) for k in (1, 3, 5)]) / 255
         else:
             encoded = np.array([float(v) for v in re.split(r"[\s,]+", value.strip())])
-        linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
         element.tag = "rgb"
-        element.set("value", ", ".join(f"{v:.6g}" for v in linear))
+        element.set("value", ", ".join(f"{v:.6g}" for v in linear(encoded)))
 
 
 def _rewrite(document: Document, parent: ET.Element, index: dict[str, ET.Element]) -> None:

@@ -18,6 +18,7 @@ import trimesh
 from PIL import Image
 
 from nlt.errors import UserError
+from nlt.scenes.mitsuba_xml import linear
 
 
 @dataclass(frozen=True)
@@ -234,11 +235,6 @@ def _nodes(header: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]
             local[:3, 3] = node.get("translation", [0, 0, 0])
         yield node, parent @ local
         waiting += [(child, parent @ local) for child in node.get("children", [])]
-
-
-def linear(encoded: np.ndarray) -> np.ndarray:
-    """sRGB to linear, in [0, 1]."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 # Wavefront OBJ is read here: trimesh joins all parts of one material and loses the texture coordinates of quads.
