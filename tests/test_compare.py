@@ -13,16 +13,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from made_results import make_results, papers_numbers
 from PIL import Image
 from skimage.metrics import structural_similarity
 from tiny import DATASET, SCALE, use_tiny_inception, write
 from torch.utils.data import default_collate
 
 from nlt import paths, training
+from nlt.baselines.cnn import CNN
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock, compare
+from nlt.evaluation.frames import Frames
+from nlt.evaluation.report import draw
+from nlt.evaluation.results import load, write_rows
 from nlt.models.module import RenderingModule
 from nlt.paths import CONFIGS, PROJECT
 
@@ -33,9 +38,17 @@ ACCURACY = ("mse", "unbiased_mse", "reference_noise", "mssim", "fid", "feature_l
 STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
 UNTRAINED = ("path_tracing_1", "path_tracing_4", "path_tracing_16", "oidn_1", "oidn_4")
 STEPS = 6  # 4 to an epoch
-# A method that nothing in the package knows of.
+# Methods that nothing in the package knows of.
 EXTRA = """
 from nlt.baselines.cnn import CNN
+
+class Diverges(CNN):
+    def features(self, batch, transported=None):
+        return super().features(batch) * float("nan")
+
+class Fails(CNN):
+    def training_step(self, batch, batch_idx):
+        raise RuntimeError("out of\\nluck")
 
 class Extra(CNN):
     stages = ("photons", "gbuffer")
@@ -282,3 +295,172 @@ def test_a_lost_mark_costs_no_step(world, trainings):
     row = world.compare("--methods", "cnn")["cnn"]
     assert len(trainings) == 1 and any(argument.startswith("--ckpt_path=") for argument in trainings[0])
     assert row["mse"] == world.rows["cnn"]["mse"]
+
+
+# ---- rows that fail, seeds, sizes -----------------------------------------------------------------------
+
+
+def test_rows_that_diverge_or_fail_are_shown(world, trainings):
+    """The others go on; what diverged is not trained again, what died is, twice."""
+    for name in ("Diverges", "Fails"):
+        write(world.folder / f"configs/model/{name.lower()}.yaml", {"model": {"class_path": f"extra_method.{name}"}})
+    try:
+        rows = world.compare("--methods", "cnn", "diverges", "fails", out="bad")
+        assert [rows[name]["status"] for name in ("cnn", "diverges", "fails")] == [
+            "ok", "1 of 1 diverged", "1 of 1 failed",
+        ]  # fmt: skip
+        runs = world.runs("bad")
+        assert "train/loss is nan at step 0" in runs["diverges"]["message"]
+        assert runs["fails"]["message"] == "RuntimeError: out of luck"
+        assert rows["fails"]["mse"] == rows["diverges"]["mse"] == "" and float(rows["cnn"]["mse"]) > 0
+        table = (world.folder / "bad/table.md").read_text()
+        assert "| diverges [1 of 1 diverged] | – |" in table
+        assert len(trainings) == 3
+        world.compare("--methods", "diverges", out="bad")
+        assert len(trainings) == 3
+    finally:
+        for name in ("diverges", "fails"):
+            (world.folder / f"configs/model/{name}.yaml").unlink()
+
+
+def test_seeds(world, trainings):
+    rows = world.compare("--seeds=2", "--methods", "cnn", "path_tracing_1", out="seeds")
+    assert len(trainings) == 1  # seed 3 was there
+    with (world.folder / "seeds/runs.csv").open(newline="") as file:
+        runs = list(csv.DictReader(file))
+    assert [(run["method"], run["seed"]) for run in runs] == [("cnn", "3"), ("cnn", "4"), ("path_tracing_1", "3")]
+    values = [float(run["mse"]) for run in runs[:2]]
+    assert values[0] == float(world.rows["cnn"]["mse"]) != values[1]
+    assert float(rows["cnn"]["mse"]) == pytest.approx(statistics.mean(values))
+    assert float(rows["cnn"]["mse_std"]) == pytest.approx(statistics.stdev(values))
+    assert rows["path_tracing_1"]["mse_std"] == ""
+    cell = f"{statistics.mean(values):.5f} ± {statistics.stdev(values):.5f} / 0.01 "
+    assert cell in (world.folder / "seeds/table.md").read_text()
+
+
+def test_stored_images_and_metrics_are_of_the_same_predictions(world):
+    """For every method: the metrics of each view, recomputed from images/*.npz."""
+    results = load(world.folder / "out")
+    reference = results.images("reference")
+    target = [shown_radiance(r, e) for r, e in zip(reference["radiance"], reference["exposure"], strict=True)]
+    for method in world.rows:
+        images = results.images(method)["radiance"]
+        mse = [
+            np.mean((shown_radiance(f, e) - t) ** 2)
+            for f, e, t in zip(images, reference["exposure"], target, strict=True)
+        ]
+        np.testing.assert_allclose(mse, results.per_view(method, "mse"), rtol=0.01)
+        assert results.mean(method, "mse") == pytest.approx(results.per_view(method, "mse").mean())
+    dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test", ())
+    noisy = results.images("noisy")["radiance"]
+    np.testing.assert_allclose(noisy[1], dataset[1]["noisy"], rtol=1e-3, atol=1e-3)
+
+
+def shown_radiance(radiance, exposure):
+    return shown(torch.from_numpy(radiance[None].astype(np.float32)), {"exposure": torch.tensor(exposure)})
+
+
+def test_traced_pixels_are_no_stored_ones(world):
+    """Deterministic; less noisy with more samples; not the teaching target, not the reference's."""
+    dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test")
+    frames = Frames(dataset)
+    images = {spp: frames.traced(1, spp) for spp in (1, 2, 32)}
+    frames.place(2)
+    frames.traced.cache_clear()
+    assert all(torch.equal(image, frames.traced(1, spp)) for spp, image in images.items())
+    for name in ("noisy", "reference_a", "reference_b"):
+        assert not any(torch.equal(dataset[1][name], image) for image in images.values())
+    error = {spp: (image - frames.traced(1, 64)).square().mean() for spp, image in images.items()}
+    assert error[32] < error[1] / 4
+
+
+def test_sizes(world):
+    """Of a network small enough to count by hand: parameters, FLOPs, memory."""
+
+    class OneConvolution(CNN):
+        def synthesize(self, batch, features):
+            return self.unet.conv_in(features)[:, :3]
+
+    frames = Frames(LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test"))
+    module = OneConvolution(width=5)
+    size = clock.Clock(frames, torch.device("cpu")).size(module)
+    assert size["parameters"] == sum(p.numel() for p in module.parameters())
+    pixels, channels = 16 * 16, 10
+    assert size["flops"] == 2 * 9 * channels * 5 * pixels
+    # The features' concatenation and the convolution's output; inputs and parameters besides.
+    inputs = 4 * (pixels * channels + 1) + 2 * 8
+    assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + 5)
+    assert set(clock.Clock(frames, torch.device("cpu")).size(compare.untrained("oidn_1"))) == {"parameters"}
+
+
+# ---- drawn from results ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Results with the paper's numbers, three seeds, one method that diverged and one without FID."""
+    rows = papers_numbers("table2")
+    del rows["cnn"]["fid"]
+    directory = tmp_path_factory.mktemp("made")
+    results = make_results(directory, rows, "table2", seeds=3, over_seeds=0.02, over_views=0.1, images=True)
+    bad = {"method": "lost", "seed": 0, "status": "diverged", "message": "train/loss is nan"}
+    write_rows(directory / "runs.csv", [*results.runs, bad])
+    draw(directory)
+    return load(directory)
+
+
+def test_tables_carry_the_same_numbers(made):
+    """CSV against Markdown against LaTeX, cell by cell."""
+    markdown = (made.directory / "table.md").read_text()
+    first = [line.strip("| ").split(" | ") for line in markdown.partition("\n## ")[0].splitlines() if line[:1] == "|"]
+    latex = (made.directory / "table.tex").read_text().partition("\\bottomrule")[0].partition("\\midrule")[2]
+    tex = [line.removesuffix(r" \\").split(" & ") for line in latex.strip().splitlines()]
+    with (made.directory / "table.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(first) - 2 == len(tex) == 15
+    for row, cells, tex_cells in zip(rows, first[2:], tex, strict=True):
+        assert [cell.replace("±", r"$\pm$").replace("–", "--") for cell in cells[1:]] == tex_cells[1:]
+        for key, cell in zip(("time_per_frame_s", "mse", "mssim", "fid", "feature_l1"), cells[1:], strict=True):
+            mean, _, std = cell.partition(" / ")[0].partition(" ± ")
+            if not row[key]:
+                assert mean == "–"
+                continue
+            digits = len(mean.partition(".")[2])
+            assert mean == f"{float(row[key]):.{digits}f}" and std == f"{float(row[f'{key}_std']):.{digits}f}"
+    assert [row["method"] for row in rows if not row["fid"]] == ["cnn", "lost"]
+    assert rows[-1]["status"] == "1 of 1 diverged" and first[-1][0] == "lost [1 of 1 diverged]"
+
+
+def test_interval_is_of_the_views(made):
+    values = made.per_view("nlt", "mse")
+    low, high = made.interval("nlt", "mse")
+    error = values.std(ddof=1) / len(values) ** 0.5
+    assert low < values.mean() < high and (high - low) / (2 * 1.96 * error) == pytest.approx(1, abs=0.15)
+    assert np.isnan(made.interval("nlt", "fid")).all()
+
+
+def test_drawing_again_changes_no_byte(made, tmp_path):
+    """Elsewhere, too, without anything but the directory."""
+    files = {path.name: path.read_bytes() for path in made.directory.iterdir() if path.is_file()}
+    assert {"table.csv", "table.md", "table.tex", "claims.md", "claims.json", "speed_accuracy.svg"} <= set(files)
+    copy = shutil.copytree(made.directory, tmp_path / "copy")
+    for name in set(files) - {"runs.csv", "views.csv", "manifest.json"}:
+        (copy / name).unlink()
+    assert main(["report", str(copy)]) == 0
+    assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == files
+
+
+def test_without_images_the_rest_is_drawn(made, tmp_path):
+    copy = shutil.copytree(made.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("images", "*.png"))
+    assert main(["report", str(copy)]) == 0
+    assert (copy / "speed_accuracy.png").exists() and not (copy / "samples.png").exists()
+
+
+@pytest.mark.parametrize(("file", "content"), [("manifest.json", None), ("runs.csv", None), ("manifest.json", "{")])
+def test_results_that_cannot_be_read(made, tmp_path, capfd, file, content):
+    copy = shutil.copytree(made.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("images"))
+    (copy / file).unlink() if content is None else write(copy / file, content)
+    capfd.readouterr()
+    assert main(["report", str(copy)]) == 2
+    error = capfd.readouterr().err
+    assert error.startswith(f"nlt: error: {copy / file}: ") and error.count("\n") == 1

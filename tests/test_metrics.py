@@ -15,6 +15,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional as F
 
 from nlt.errors import UserError
+from nlt.metrics import image_metrics, jackknife
 from nlt.metrics import inception as inception_module
 from nlt.metrics.display import display
 from nlt.metrics.image_metrics import FID, KID, SLOW, ImageMetrics, feature_l1, flip, unbiased_mse
@@ -192,6 +193,30 @@ def test_kid_is_the_unbiased_mmd():
     off = ~np.eye(9, dtype=bool)
     expected = kernel(x, x)[off].mean() + kernel(y, y)[off].mean() - 2 * kernel(x, y).mean()
     assert metric.compute().item() == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 12, 70])
+def test_jackknife_of_fid_and_kid(count, monkeypatch):
+    """Against the metrics themselves, of the images without a group; one image to a group up to GROUPS."""
+    monkeypatch.setattr(jackknife, "GROUPS", 35)
+    monkeypatch.setattr(image_metrics._PooledFeatures, "num_features", 24)
+    generator = torch.Generator().manual_seed(0)
+    real, fake = (torch.rand(count, 24, generator=generator) for _ in range(2))
+    values = jackknife.fid_and_kid_without(fake, real)
+    assert all(value.shape == (count,) for value in values.values())
+    for left_out in (0, count - 1):
+        kept = [k for k in range(count) if k % 35 != left_out % 35]
+        for key, metric, tolerance in (("fid_without", FID(), 2e-3), ("kid_without", KID(), 1e-3)):
+            for features, is_real in ((real, True), (fake, False)):
+                metric.update(features[kept], real=is_real)
+            np.testing.assert_allclose(values[key][left_out], metric.compute(), rtol=tolerance, atol=1e-5)
+
+
+def test_standard_error_of_a_mean():
+    """The jackknife of a mean is the textbook's."""
+    values = np.random.default_rng(0).standard_normal(20)
+    without = (values.sum() - values) / 19
+    assert jackknife.standard_error(without) == pytest.approx(values.std(ddof=1) / np.sqrt(20))
 
 
 def test_flip():

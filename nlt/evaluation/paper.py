@@ -32,6 +32,7 @@ def order(method: str) -> tuple[int, str]:
 
 
 def published(table: str | None, method: str) -> dict[str, float]:
-    """The paper's row of a method in "table1" or "table2", by column; empty where it has none."""
-    row = paper().get(table or "", {}).get(method)
-    return dict(zip(paper()["columns"], row, strict=True)) if row else {}
+    """The paper's row of a method in one of `tables()`, by column; empty where it has none."""
+    content = paper().get(table or "", {})
+    row = content.get(method)
+    return dict(zip(content.get("columns", paper()["columns"]), row, strict=True)) if row else {}

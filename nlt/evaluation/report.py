@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
 from nlt.evaluation.results import load
 from nlt.evaluation.tables import write_tables
@@ -17,5 +18,7 @@ def draw(directory: str | Path) -> None:
     """
     results = load(directory)
     write_tables(results)
+    for claim in write_claims(results):
+        print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
     draw_samples(results)
     draw_speed_accuracy(results)

@@ -37,7 +37,7 @@ from nlt.metrics.quantities import QUANTITIES
 
 MANIFEST, RUNS, VIEWS, IMAGES = "manifest.json", "runs.csv", "views.csv", "images"
 OK, DIVERGED, FAILED = "ok", "diverged", "failed"
-_LEVEL, _RESAMPLES = 0.95, 2000
+LEVEL, _RESAMPLES = 0.95, 2000
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Results:
         if len(values) < 2:
             return math.nan, math.nan
         found = scipy.stats.bootstrap(
-            (values,), np.mean, confidence_level=_LEVEL, n_resamples=_RESAMPLES, method="percentile",
+            (values,), np.mean, confidence_level=LEVEL, n_resamples=_RESAMPLES, method="percentile",
             rng=np.random.default_rng(0),
         ).confidence_interval  # fmt: skip
         return float(found.low), float(found.high)

@@ -55,8 +55,7 @@ def tables(results: Results) -> list[Table]:
     )
     if table:
         note += (
-            f" After the slash the paper's figures (its {table.replace('table', 'Table ')}: 256x256 pixels, 100,000 "
-            "training images per scene, four scenes, 300,000 iterations, a GPU). Another scale and other scenes: "
+            f" After the slash the paper's figures ({paper()[table]['scale']}, a GPU). Another scale and other scenes: "
             "compare the order of the methods, not the numbers."
         )
     stages = tuple(f"{stage}_s" for stage in STAGES if any(_measured(results, f"{stage}_s")))
