@@ -271,8 +271,8 @@ def kitchen() -> Shapes:
         **place(stool(wood, 0.6), "stool", (1.7, 0, 1.45)),
         **place(door(wood, paint, steel), "door", (2.1, 0, 0.65), -90),
         **place(clock(white, black), "clock", (2.1, 1.9, -0.35), -90),
-        **place(hung(silver, wood, 0.6, 0.8), "mirror", (-0.6, 1.5, 1.8), 180),
-        **place(hung(picture, wood, 0.5, 0.5), "picture", (0.9, 1.6, 1.8), 180),
+        **place(hung(silver, wood, 0.6, 0.8), "mirror", (0.4, 1.5, 1.8), 180),
+        **place(hung(picture, wood, 0.5, 0.5), "picture", (-1.45, 1.55, 1.8), 180),
     }
 
 
