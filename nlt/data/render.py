@@ -15,7 +15,8 @@ from nlt.rendering.variant import use_variant
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.pointcloud import sample_points
-from nlt.scenes.state import rest_state, sample_view
+from nlt.scenes.state import rest_state
+from nlt.scenes.views import Views
 
 _TRIES = 3
 
@@ -29,6 +30,7 @@ class SampleRenderer:
         self.description = spec.descriptions[scene]
         self.scene = Scene(self.description, spec.experiment)
         self.renderer = Renderer(self.scene, spec.teacher)
+        self.views = Views(self.scene)
         self._states: dict[str, Any] | None = None
         self._taken: set[bytes] = set()  # states of the evaluated splits
         if threads:
@@ -36,7 +38,10 @@ class SampleRenderer:
 
     def points(self) -> dict[str, np.ndarray]:
         """The scene's point cloud."""
-        return sample_points(self.scene, self.spec.points, self.spec.seed)
+        points = sample_points(self.scene, self.spec.points, self.spec.seed)
+        share = float(points["area_share"])
+        print(f"{self.description.name}: points on the {share:.1%} of the surface that may be seen", flush=True)
+        return points
 
     def place(self, split: str, index: int, rest: bool = False) -> Camera:
         """Put the scene into the state of a sample and return the sample's camera.
@@ -54,7 +59,7 @@ class SampleRenderer:
             state = listed[index] if index < len(listed) else spec.state(split, self.index, index, self._taken)
         self.scene.set_state(state)
         rng = np.random.default_rng(spec.seeds(split, self.index, index).spawn(2)[1])
-        return sample_view(self.description, spec.resolution, rng)
+        return self.views.sample(spec.resolution, rng)
 
     def sample(
         self, split: str, index: int, rest: bool = False, only: Collection[str] | None = None

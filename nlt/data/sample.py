@@ -6,6 +6,9 @@ what a batch adds to both (`BATCH_FIELDS`). Everything is in metres, world coord
 Conventions. Images are channels first. Pixel (i, j), column i and row j, covers [i, i+1) x [j, j+1) of the
 continuous image plane, so its centre is (i + 0.5, j + 0.5). View space has x to the right, y down and z
 forward; a world point p is seen at K T p, and its pixel is the floor of that.
+
+Photons are those that arrive in the room: that cross `room`, if the scene has one, before they first meet a surface.
+Most of a sky's do not, and are cast until P have arrived.
 """
 
 from __future__ import annotations
@@ -56,9 +59,9 @@ FIELDS: dict[str, Field] = {
     "world_to_view": Field((4, 4), "float32", "m", "T, rigid"),
     "photon_origin": Field(("P", 3), "float32", "m", "where the photon left its emitter"),
     "photon_direction": Field(("P", 3), "float16", "1", "unit direction of emission"),
-    "photon_flux": Field(("P", 3), "float32", "W", "RGB flux carried; all photons of a sample sum to the power"),
-    "photon_hit": Field(("P", 3), "float32", "m", "first intersection with the scene, 0 where it left the scene"),
-    "photon_valid": Field(("P",), "bool", "", "the photon hit something"),
+    "photon_flux": Field(("P", 3), "float32", "W", "RGB flux carried; those of a sample sum to the power that arrives"),
+    "photon_hit": Field(("P", 3), "float32", "m", "first intersection with the scene"),
+    "photon_valid": Field(("P",), "bool", "", "it arrived; 0 in all fields is what did not before the bound"),
     "translation": Field(("M", 3), "float32", "m", "of each movable object, from its place in the scene file"),
     "present": Field(("M",), "bool", "", "the movable object is in the scene"),
 }
@@ -70,6 +73,7 @@ POINT_FIELDS: dict[str, Field] = {
     "emission": Field(("N", 3), "float32", _RADIANCE, "emitted radiance"),
     "shape": Field(("N",), "int32", "", "index of the shape in the scene"),
     "object": Field(("N",), "int32", "", "index of the movable object, -1 for what never moves"),
+    "area_share": Field((), "float32", "1", "of the scene's surface: what may come to be seen, where the points lie"),
 }
 
 BATCH_FIELDS: dict[str, Field] = {

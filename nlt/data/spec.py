@@ -20,7 +20,7 @@ from nlt.errors import UserError
 from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 1  # of the files on disk
+FORMAT = 2  # of the files on disk
 # Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
 SECTIONS = ("data", "model", "trainer", "seed_everything")
 DATA = ("dataset", "root", "batch_size", "workers", "seed", "online")

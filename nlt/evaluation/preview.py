@@ -15,7 +15,8 @@ from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.scenes.assembly import Scene
 from nlt.scenes.description import load_description
-from nlt.scenes.state import sample_state, sample_view
+from nlt.scenes.state import sample_state
+from nlt.scenes.views import Views
 
 _TITLE, _GAP = 24, 4  # pixels
 
@@ -58,12 +59,12 @@ def _images(name: str, views: int, resolution: int, spp: int, experiment: str, s
     use_variant()
     description = load_description(name)
     scene = Scene(description, experiment)
-    renderer = Renderer(scene)
+    renderer, sampler = Renderer(scene), Views(scene)
     images = []
     for k in range(views):
         rng = np.random.default_rng([seed, k])
         scene.set_state(sample_state(description, experiment, rng))
-        radiance = renderer.radiance(sample_view(description, resolution, rng), spp, seed + k)
+        radiance = renderer.radiance(sampler.sample(resolution, rng), spp, seed + k)
         shown = display(torch.from_numpy(radiance)[None], description.exposure)[0]
         images.append((shown.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     return images

@@ -6,7 +6,6 @@ Everything comes back as numpy arrays in metres, world coordinates and linear, u
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -16,14 +15,16 @@ import numpy as np
 from nlt.errors import UserError
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
-from nlt.scenes.lanes import is_jit, launch
+from nlt.scenes.lanes import freeze, is_jit, launch
 from nlt.scenes.pointcloud import diffuse_albedo
 
 log = logging.getLogger(__name__)
 
 # Lanes traced at once: bounds memory (about 1 kB a lane).
 _MAX_LANES = 1 << 20
-_POWER_SAMPLES = 4096
+_PILOT = 1 << 15  # photons cast per emitter to find out how many arrive
+_MOST_CASTS = 1024  # per photon that is to arrive
+_WALL = 0.005  # metres: what meets a wall's outer side does not cross the room
 
 
 class Renderer:
@@ -45,12 +46,16 @@ class Renderer:
             {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
         )
         self.emitters = list(scene.mi_scene.emitters())
-        freeze: Callable = dr.freeze if is_jit() else lambda kernel: kernel
-        # A frozen kernel is traced once, not at every call: 6 ms instead of 300 ms for a 64x64 image at 1 spp.
         self._radiance = freeze(_radiance if self.teacher == "path" else _bidirectional)
         self._gbuffer = freeze(_gbuffer)
         self._photons = [freeze(_photons) for _ in self.emitters]
-        self._powers: dict[tuple[bool, ...], np.ndarray] = {}  # by scene.lit
+        self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
+        room = scene.description.room
+        box = np.outer([-1e9, 1e9], np.ones(3)) if room is None else room + np.array([[_WALL], [-_WALL]])
+        low, high = (box * scene.description.units_per_metre).tolist()
+        self._room = {"low": mi.Point3f(low), "high": mi.Point3f(high)}
+        if is_jit():
+            dr.make_opaque(self._room)
 
     def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
         """The teacher's radiance; traces the pixels asked for and no others.
@@ -132,50 +137,78 @@ class Renderer:
         image = lambda a: np.where(valid[:, None], a, 0).T.reshape(-1, camera.height, camera.width)
         return {"depth": image(depth[:, None]).astype(np.float32), "normal": image(normal), "albedo": image(albedo)}
 
-    @property
-    def powers(self) -> np.ndarray:
-        """(E,) mean power over RGB of each emitter in scene units: the mean weight of its sampled rays."""
-        if self.scene.lit not in self._powers:
-            uniform = np.random.default_rng(0).random((_POWER_SAMPLES, 5))
-            powers = [self._cast(k, uniform)[2].mean() for k in range(len(self.emitters))]
-            self._powers[self.scene.lit] = np.array(powers)
-        return self._powers[self.scene.lit]
-
-    def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
-        lanes = {
-            "u0": ("Float", uniform[:, 0]),
-            "u1": ("Point2f", uniform[:, 1:3]),
-            "u2": ("Point2f", uniform[:, 3:5]),
-        }
-        fixed = {"scene": self.scene.mi_scene, "emitter": self.emitters[emitter]}
-        return launch(self._photons[emitter], lanes, **fixed)
-
     def photons(self, count: int, seed: int) -> dict[str, np.ndarray]:
-        """Photons from all emitters in proportion to power, and where they first meet the scene.
+        """Photons that arrive in the room, from all emitters in proportion to the power that arrives from each.
+
+        A photon arrives if it crosses the description's `room` before it first meets a surface; without a `room`, if
+        it meets a surface. Casting goes on until `count` have arrived, at most 1024 casts for each.
 
         Returns:
             photon_origin, photon_direction, photon_flux, photon_hit (count, 3) and photon_valid (count,).
-            Flux sums, in expectation, to the emitters' power.
+            Flux sums, in expectation, to the power that arrives. What has not arrived by the bound is zero, not valid.
         """
         rng = np.random.default_rng(seed)
-        share = self.powers / self.powers.sum()
+        arriving, reach = self._arriving()
+        share = arriving / arriving.sum()
         # Systematic resampling: each emitter gets its share of the photons, rounded at random.
         edges = np.floor(np.concatenate([[0], np.cumsum(share)]) * count + rng.random())
         edges[-1] = edges[0] + count
         parts = []
         for k, number in enumerate(np.diff(edges).astype(int)):
             if number:
-                origin, direction, flux, hit, valid = self._cast(k, rng.random((number, 5)))
-                parts.append((origin, direction, flux / (share[k] * count), hit, valid))
+                origin, direction, flux, hit, valid = self._arrivals(k, number, reach[k], rng)
+                parts.append((origin, direction, flux * (number / (share[k] * count)), hit, valid))
         origin, direction, flux, hit, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
         units = self.scene.description.units_per_metre
         return {
             "photon_origin": origin / units,
             "photon_direction": direction,
             "photon_flux": flux / units**2,
-            "photon_hit": np.where(valid[:, None], hit / units, 0),
-            "photon_valid": valid.astype(bool),
+            "photon_hit": hit / units,
+            "photon_valid": valid,
         }
+
+    def _arriving(self) -> tuple[np.ndarray, np.ndarray]:
+        """Per emitter, estimated: the arriving power, mean over RGB, in scene units; the share of casts that arrive."""
+        lit = self.scene.lit
+        if lit.key not in self._pilots:
+            uniform = np.random.default_rng(0).random((_PILOT, 5), np.float32)
+            with self.scene.in_state(lit):
+                casts = [self._cast(k, uniform) for k in range(len(self.emitters))]
+            # As if at least one had arrived: an emitter that seems to light nothing still gets its photons, if few.
+            reach = np.array([max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts])
+            power = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
+            self._pilots[lit.key] = np.array(power), reach
+        return self._pilots[lit.key]
+
+    def _arrivals(self, emitter: int, number: int, reach: float, rng: np.random.Generator) -> list[np.ndarray]:
+        """Origin, direction, flux, hit (number, 3) and valid (number,) of photons of one emitter that arrive."""
+        found: list[tuple[np.ndarray, ...]] = []
+        missing, cast, most = number, 0, number * _MOST_CASTS
+        while missing and cast < most:
+            width = min(int(1.1 * missing / reach) + 64, most - cast, _MAX_LANES)
+            *columns, arrived = self._cast(emitter, rng.random((width, 5), np.float32))
+            rows = np.flatnonzero(arrived)[:missing]
+            found.append(tuple(column[rows] for column in columns))
+            missing -= len(rows)
+            cast += width if missing else int(rows[-1]) + 1
+        # Inverse binomial sampling. Stopping at the n-th arrival, after N casts, n / N would be too large on average;
+        # (n - 1) / (N - 1) is unbiased (Haldane 1945), and m / N is where the bound came first (Girshick et al. 1946).
+        arrivals = number - missing
+        share = arrivals / cast if missing or cast == 1 else (arrivals - 1) / (cast - 1)
+        origin, direction, flux, hit = (np.concatenate(column) for column in zip(*found, strict=True))
+        columns = [origin, direction, flux * (share / max(arrivals, 1)), hit, np.ones(arrivals, bool)]
+        return [np.concatenate([c, np.zeros((missing, *c.shape[1:]), c.dtype)]) for c in columns]
+
+    def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
+        """In scene units, of an emitter's photons: origin, direction, flux, hit (n, 3); whether they arrive (n,)."""
+        lanes = {
+            "u0": ("Float", uniform[:, 0]),
+            "u1": ("Point2f", uniform[:, 1:3]),
+            "u2": ("Point2f", uniform[:, 3:5]),
+        }
+        fixed = {"scene": self.scene.mi_scene, "emitter": self.emitters[emitter], **self._room}
+        return launch(self._photons[emitter], lanes, **fixed)
 
 
 def _ray(corner: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:
@@ -212,10 +245,13 @@ def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
     return interaction.p, interaction.sh_frame.n, albedo, valid
 
 
-def _photons(scene: Any, emitter: Any, u0: Any, u1: Any, u2: Any) -> tuple:
+def _photons(scene: Any, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2: Any) -> tuple:
     ray, weight = emitter.sample_ray(mi.Float(0), u0, u1, u2)
     interaction = scene.ray_intersect(ray)
-    return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid()
+    to_low, to_high = (low - ray.o) / ray.d, (high - ray.o) / ray.d
+    enter, leave = dr.max(dr.minimum(to_low, to_high)), dr.min(dr.maximum(to_low, to_high))
+    crosses = (enter < leave) & (leave > 0) & (enter < interaction.t)
+    return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid() & crosses
 
 
 def _available(teacher: str, replaceable: bool) -> str:

@@ -6,6 +6,8 @@ only sets their instances' transforms. Emitting shapes cannot be instanced and s
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,11 +152,12 @@ class Scene:
         faces = np.array([[0, 1, 2], [0, 2, 3]])
         return Shape(MOVING_LIGHT, vertices, faces, None, rectangle.bsdf(), rectangle.emitter())
 
-    def _light_transform(self, translation: np.ndarray) -> Any:
+    def _light_transform(self, translation: np.ndarray, scale: float = 1.0) -> Any:
         light, units = self.description.light, self.description.units_per_metre
         assert light is not None
         matrix = np.eye(4)
-        matrix[:3, :3] = _facing_down(self.description.up) * [light.size[0] / 2, light.size[1] / 2, 1] * units
+        half = light.size / 2 * scale
+        matrix[:3, :3] = _facing_down(self.description.up) * [*half, scale] * units
         matrix[:3, 3] = (light.centre + translation) * units
         return mi.ScalarTransform4f(matrix.tolist())
 
@@ -166,7 +169,7 @@ class Scene:
             centre = self._centres[movable.name] * units
             offset, scale = translation.astype(float) * units, 1.0 if present else _SPECK
             if movable.name == MOVING_LIGHT:
-                transform = self._light_transform(translation.astype(float))
+                transform = self._light_transform(translation.astype(float), scale)
                 self._parameters[f"emitter_{MOVING_LIGHT}.to_world"] = transform
             if movable.name in self._instances:
                 to_world = mi.ScalarTransform4f().translate(list(centre * (1 - scale) + offset)).scale(scale)
@@ -180,11 +183,21 @@ class Scene:
                 # Otherwise the transforms are literals, and every state compiles its kernels anew.
                 dr.make_opaque({key: self._parameters[key] for key in self._parameters.keys()})  # noqa: SIM118
 
+    @contextmanager
+    def in_state(self, state: SceneState) -> Iterator[None]:
+        """The scene in another state for a while."""
+        before = self.state
+        self.set_state(state)
+        try:
+            yield
+        finally:
+            self.set_state(before)
+
     @property
-    def lit(self) -> tuple[bool, ...]:
-        """Which of the movable objects that emit light are present: what the emitters' powers depend on."""
-        present = zip(self.movables, self.state.present, strict=True)
-        return tuple(bool(there) for movable, there in present if self._moving_meshes[movable.name])
+    def lit(self) -> SceneState:
+        """At rest, without those objects that emit light and are removed: what the emitters' powers depend on."""
+        emits = np.array([bool(self._moving_meshes[movable.name]) for movable in self.movables], bool)
+        return SceneState(np.zeros_like(self.state.translation), self.state.present | ~emits)
 
     def _centre(self, movable: Movable) -> np.ndarray:
         vertices = np.concatenate([self.shapes[name].vertices for name in movable.shapes])

@@ -61,7 +61,8 @@ class MovingLight:
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling).
+    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling); unless
+    the file has one, `look_at` is half as large as `camera` and in its middle.
 
     `room` (2, 3) bounds the inside of the room, None where the whole scene is meant. `teacher` is the integrator
     with the lower variance at equal time in this scene.
@@ -154,6 +155,13 @@ class _Section:
             raise UserError(f"{self.file}: {self.field(key)}: is empty: minimum {box[0]} above maximum {box[1]}")
         return box
 
+    def min_max(self, key: str) -> np.ndarray:
+        section = _Section(self.file, self.field(key), self.get(key), ("min", "max"))
+        box = np.stack([section.numbers(end, (3,)) for end in ("min", "max")])
+        if (box[0] > box[1]).any():
+            raise UserError(f"{self.file}: {self.field(key)}: is empty: min is above max")
+        return box
+
 
 def load_description(name: str, need_source: bool = True) -> SceneDescription:
     """Read `configs/scenes/<name>.yaml`, or the file at a path.
@@ -170,7 +178,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     except yaml.YAMLError as error:
         raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
     keys = (
-        *("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "room", "teacher"),
+        *("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "look_at", "room", "teacher"),
         *("objects", "moving_light"),
     )
     top = _Section(file, "", data, keys)
@@ -181,10 +189,8 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     fov = float(top.positive("fov", default=70.0))
     if fov >= 180:
         raise UserError(f"{file}: fov: must be below 180 degrees, is {fov:g}")
-    view = _Section(file, "camera", top.get("camera"), ("min", "max"))
-    camera = np.stack([view.numbers("min", (3,)), view.numbers("max", (3,))]) * scale
-    if (camera[0] > camera[1]).any():
-        raise UserError(f"{file}: camera: is empty: min is above max")
+    camera = top.min_max("camera") * scale
+    half = camera.mean(0) + (camera - camera.mean(0)) / 2
     teacher = top.get("teacher", "path")
     if teacher not in TEACHERS:
         raise UserError(f"{file}: teacher: must be one of {', '.join(TEACHERS)}, is {teacher!r}")
@@ -217,7 +223,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
         exposure=float(top.positive("exposure", default=1.0)),
         fov=fov,
         camera=camera,
-        look_at=camera.mean(0) + (camera - camera.mean(0)) / 2,
+        look_at=top.min_max("look_at") * scale if "look_at" in data else half,
         objects=tuple(objects),
         light=light,
         room=top.box("room") * scale if "room" in data else None,

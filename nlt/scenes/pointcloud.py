@@ -8,9 +8,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nlt.errors import UserError
 from nlt.scenes.assembly import Scene, Shape
 from nlt.scenes.description import MATERIALS
-from nlt.scenes.lanes import launch
+from nlt.scenes.lanes import freeze, is_jit, launch
+from nlt.scenes.state import SceneState, rest_state
+from nlt.scenes.views import Views
+
+_EYES = 64
+_RECESS = 0.6  # metres
+_SURFACE = 1e-4  # of the way from an eye to a point: what is hit there is the point's own surface
+_MOST_CANDIDATES = 1000  # per point
+_BATCH = 1 << 20
 
 
 def sample_cdf(weights: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -22,31 +31,101 @@ def sample_cdf(weights: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
     """The scene's points, every object in its place in the scene file: all fields of `POINT_FIELDS`.
 
-    Shapes are drawn by area, then triangles by area, then a uniform point in the triangle.
+    Points are uniform by area on what may come to be seen: on movable objects, and on what is in direct sight of one
+    of 64 random views while all movable objects are removed. (Glass is a surface, as in the G-buffer: it hides what is
+    behind it.) In a scene with a `room`, nothing is further from it than 0.6 m, the depth of a window's recess.
+
+    Raises:
+        UserError: less than a thousandth of the scene's surface is so.
     """
     rng = np.random.default_rng(seed)
     shapes = list(scene.shapes.values())
-    areas = [shape.face_areas for shape in shapes]
     owner = {name: k for k, movable in enumerate(scene.movables) for name in movable.shapes}
-    which = sample_cdf(np.array([a.sum() for a in areas]), rng.random(count))
+    owners = np.array([owner.get(shape.id, -1) for shape in shapes])
+    in_sight = _InSight(scene, rng.spawn(1)[0])
+    kept: list[tuple[np.ndarray, ...]] = []
+    found = tried = 0
+    with scene.in_state(in_sight.state):
+        while found < count:
+            if tried >= _MOST_CANDIDATES * count:
+                raise UserError(
+                    f"{scene.description.file}: camera: only {found} of {tried} points of the scene's surface can be "
+                    f"seen from it; move the box into the room, or take the surroundings out of the scene"
+                )
+            width = min(int(1.1 * (count - found) * max(tried, 1) / max(found, 1)) + 64, _BATCH)
+            which, position, uv = _candidates(shapes, width, rng)
+            seen = np.flatnonzero(in_sight(position, owners[which] >= 0))
+            kept.append((which[seen], position[seen], uv[seen]))
+            found, tried = found + len(seen), tried + width
+    which, position, uv = (np.concatenate(column)[:count] for column in zip(*kept, strict=True))
     points: dict[str, np.ndarray] = {
-        "position": np.zeros((count, 3), np.float32),
+        "position": position.astype(np.float32),
         "material": np.zeros(count, np.uint8),
         "albedo": np.zeros((count, 3), np.float32),
         "emission": np.zeros((count, 3), np.float32),
         "shape": which.astype(np.int32),
-        "object": np.full(count, -1, np.int32),
+        "object": owners[which].astype(np.int32),
+        "area_share": np.array(found / tried, np.float32),
     }
+    for k in np.unique(which):
+        mine = which == k
+        points["material"][mine] = MATERIALS.index(material(shapes[k].bsdf))
+        points["albedo"][mine], points["emission"][mine] = _surface(shapes[k], uv[mine])
+    return points
+
+
+def _candidates(shapes: list[Shape], count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Points uniform by area: shape (count,), position (count, 3) in metres, texture coordinates (count, 2).
+
+    Shapes are drawn by area, then triangles by area, then a uniform point in the triangle.
+    """
+    areas = [shape.face_areas for shape in shapes]
+    which = sample_cdf(np.array([a.sum() for a in areas]), rng.random(count))
+    position, uv = np.zeros((count, 3)), np.zeros((count, 2))
     for k in np.unique(which):
         shape, mine = shapes[k], np.flatnonzero(which == k)
         triangle = shape.faces[sample_cdf(areas[k], rng.random(len(mine)))]
         weights = _barycentric(rng.random((len(mine), 2)))
-        points["position"][mine] = np.einsum("nk,nkd->nd", weights, shape.vertices[triangle])
-        uv = np.zeros((len(mine), 2)) if shape.uv is None else np.einsum("nk,nkd->nd", weights, shape.uv[triangle])
-        points["material"][mine] = MATERIALS.index(material(shape.bsdf))
-        points["albedo"][mine], points["emission"][mine] = _surface(shape, uv)
-        points["object"][mine] = owner.get(shape.id, -1)
-    return points
+        position[mine] = np.einsum("nk,nkd->nd", weights, shape.vertices[triangle])
+        if shape.uv is not None:
+            uv[mine] = np.einsum("nk,nkd->nd", weights, shape.uv[triangle])
+    return which, position, uv
+
+
+class _InSight:
+    """Which points may come to be seen. To be asked while the scene is in `state`, without its movable objects."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene = scene
+        rest = rest_state(scene.description, scene.experiment)
+        self.state = SceneState(rest.translation, np.zeros_like(rest.present))
+        views = Views(scene)
+        with scene.in_state(self.state):
+            self.eyes = [views.sample(1, rng).position for _ in range(_EYES)]
+        self._clear = freeze(_clear)
+
+    def __call__(self, position: np.ndarray, movable: np.ndarray) -> np.ndarray:
+        """(n,) bool of positions (n, 3) in metres that lie on movable objects or not (n,)."""
+        room, units = self.scene.description.room, self.scene.description.units_per_metre
+        outside = np.zeros(len(position), bool)
+        if room is not None:
+            outside = ((position < room[0] - _RECESS) | (position > room[1] + _RECESS)).any(1)
+        seen = movable & ~outside
+        for eye in self.eyes:
+            rows = np.flatnonzero(~seen & ~outside)
+            if len(rows):
+                lanes = {
+                    "origin": ("Point3f", np.tile(eye * units, (len(rows), 1))),
+                    "reach": ("Vector3f", (position[rows] - eye) * units),
+                }
+                seen[rows] = launch(self._clear, lanes, scene=self.scene.mi_scene)[0]
+        return seen
+
+
+def _clear(scene: Any, origin: Any, reach: Any) -> tuple:
+    ray = mi.Ray3f(origin, reach)
+    ray.maxt = 1 - _SURFACE  # type: ignore[assignment]
+    return (~scene.ray_test(ray) if is_jit() else not scene.ray_test(ray),)
 
 
 def _barycentric(uniform: np.ndarray) -> np.ndarray:
