@@ -67,6 +67,11 @@ def _run(arguments: list[str]) -> int:
         draw(options.directory)
     elif options.command == "scenes":
         _scenes(options)
+    elif options.command == "teachers":
+        from nlt.evaluation.teachers import teachers
+
+        size = options.resolution
+        teachers(options.names, options.out, options.seconds, size, options.views, options.experiment, options.seed)
     return 0
 
 
@@ -123,6 +128,13 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
     report = commands.add_parser("report", help="draw the tables and figures of results anew, on any machine")
     report.add_argument("directory", help="of the results, as `nlt compare` wrote them")
+    teachers = commands.add_parser("teachers", help="path against bdpt: variance at equal time, scene by scene")
+    teachers.add_argument("names", nargs="+", help="descriptions of scenes, by name or path")
+    teachers.add_argument("--out", type=Path, default=Path("results/teachers"))
+    for option, default in (("--seconds", 60), ("--resolution", 64), ("--views", 4)):
+        teachers.add_argument(option, type=_positive, default=default)
+    teachers.add_argument("--experiment", type=_experiment, default="fixed_lights")
+    teachers.add_argument("--seed", type=int, default=0)
     _add_scenes(commands.add_parser("scenes", help="scenes: list, show, check, preview, add"))
     return parser
 

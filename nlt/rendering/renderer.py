@@ -264,7 +264,7 @@ def _available(teacher: str, replaceable: bool) -> str:
 
         return teacher
     if not replaceable:
-        raise UserError("data.dataset.teacher: bdpt needs Mitsuba's llvm or cuda; install LLVM, or use teacher: path")
+        raise UserError("teacher: bdpt needs Mitsuba's llvm or cuda; install LLVM, or use teacher: path")
     log.warning("teacher: bdpt needs Mitsuba's llvm or cuda; using path, which has the same expectation")
     return "path"
 

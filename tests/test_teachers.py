@@ -1,0 +1,61 @@
+"""The comparison of teachers: its figures on made-up images whose variances are known, and the command."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from conftest import write_room
+
+from nlt.cli import main
+from nlt.evaluation.teachers import _SPP, _figures
+from nlt.scenes.lanes import is_jit
+
+SIZE, VIEWS, RENDERS = 16, 3, 40
+
+
+def made_up(spread, seed, shift=0.0):
+    """Images whose pixels have mean 1 and, for one sample, a variance of `spread` squared."""
+    noise = np.random.default_rng(seed).normal(0, spread / np.sqrt(_SPP), (VIEWS, RENDERS, 3, SIZE, SIZE))
+    return 1 + shift + noise
+
+
+def figures(images):
+    times = {"path": [0.2, 0.1, 0.1], "bdpt": [0.4, 0.4, 3.0]}  # medians 0.1 and 0.4 seconds
+    return _figures(images, times, 0.5, SIZE)
+
+
+def test_figures():
+    images = {"path": made_up(3.0, 0), "bdpt": made_up(1.0, 1)}
+    row = figures(images)
+    for teacher in images:
+        assert np.isclose(row[f"{teacher}_variance"], _SPP * images[teacher].var(1, ddof=1).mean(), rtol=1e-6)
+    assert np.isclose(row["bdpt_s"], 0.4 / (SIZE**2 * _SPP))
+    # A ninth of the variance in four times the time.
+    assert row["ratio_low"] < 9 / 4 < row["ratio_high"] and row["ratio_high"] - row["ratio_low"] < 0.3
+    assert row["better"] == "bdpt" and row["p_agreement"] > 1e-3 and row["path_worst_pixel"] < 0.01
+    assert figures({"path": made_up(1.0, 0), "bdpt": made_up(1.0, 1)})["better"] == "path"
+    assert figures({"path": made_up(2.0, 2), "bdpt": made_up(1.0, 3)})["better"] == "undecided"
+    assert figures({"path": made_up(1.0, 0), "bdpt": made_up(1.0, 1, shift=0.05)})["p_agreement"] < 1e-6
+
+
+def test_a_firefly_shows():
+    """One pixel makes the variance: the interval is wide, and the displayed variance hardly notices."""
+    images = {"path": made_up(1.0, 0), "bdpt": made_up(1.0, 1)}
+    images["path"][1, 7, :, 3, 4] += 300
+    row = figures(images)
+    assert row["path_worst_pixel"] > 0.9 and row["ratio_high"] > 10 * row["ratio_low"]
+    assert row["better"] == "undecided" and row["ratio"] > 2 and row["display_ratio"] < 0.3
+
+
+def test_command(tmp_path, variant, capsys):
+    if not is_jit():
+        pytest.skip("bdpt needs Mitsuba's llvm or cuda")
+    room, out = write_room(tmp_path / "room"), tmp_path / "out"
+    assert main(["teachers", str(room), "--out", str(out), "--seconds", "1", "--resolution", "8", "--views", "1"]) == 0
+    (row,) = csv.DictReader((out / "table.csv").open())
+    assert row["scene"] == "room" and float(row["p_agreement"]) > 1e-4 and float(row["ratio"]) > 0
+    assert f"| {row['better']} |" in (out / "table.md").read_text() and "room: " in capsys.readouterr().out
+    assert json.loads((out / "manifest.json").read_text())["resolution"] == 8
+    assert (out / "teachers.png").stat().st_size > 1000
+    assert main(["teachers", "palace"]) == 2 and "palace" in capsys.readouterr().err
