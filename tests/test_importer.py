@@ -15,6 +15,7 @@ from tiny import DATASET
 from nlt.cli import main
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
+from nlt.paths import scenes_root
 from nlt.scenes import importer
 from nlt.scenes.assembly import Scene, read_shape
 from nlt.scenes.description import load_description
@@ -377,6 +378,20 @@ def test_proposals(tmp_path, scale):
                 for name in set(meshes) - {"room", *movable.shapes}:
                     overlap = np.minimum(high, meshes[name].bounds[1]) - np.maximum(low, meshes[name].bounds[0])
                     assert overlap.min() < 0.03 * scale, f"{movable.name} meets {name}"
+
+
+@pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason="needs the real scenes, see README.md")
+def test_proposals_in_a_real_room():
+    """The room's bounds, and five of the objects that people marked, to the shape."""
+    folder = scenes_root() / "living-room"
+    marked = json.loads((folder / "objects.json").read_text())
+    imported = importer.read(folder / "scene.xml")
+    found = propose(imported.scene, {s.id(): read_shape(s) for s in imported.scene.shapes()}, imported.up)
+    # The alcove beside the chimney is 0.42 m deeper than the marked box.
+    np.testing.assert_allclose(found.room, marked["room_aabb"], atol=0.45)
+    proposed = [set(o.shapes) for o in found.objects]
+    for name in ("table", "sofa", "plant_right", "painting", "wall_lamp_1"):
+        assert set(marked["objects"][name]["shapes"]) in proposed, name
 
 
 def test_check_and_add(tmp_path, capsys):

@@ -63,6 +63,9 @@ def check(path: Path) -> str:
         f"{proposal.light.size[0]:.3g} x {proposal.light.size[1]:.3g} in {_span(proposal.light.box)}",
         *_objects((o.name, o.shapes, o.box) for o in proposal.objects),
     ]
+    if imported.camera is not None:
+        eye, forward = imported.camera[:3, 3], imported.camera[:3, 2]
+        lines.append(f"the file's own camera: at {_numbers(eye)}, looking along {_numbers(forward)}")
     return "\n".join(lines + [f"warning: {w}" for w in _warnings(imported, proposal)])
 
 

@@ -239,9 +239,11 @@ def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
     pairs = []
     for shift in (0.0, 0.5):
         cells = np.floor(every / distance + shift).astype(np.int64)
-        key = np.unique(np.column_stack([cells, owner]), axis=0)
-        same = (key[1:, :3] == key[:-1, :3]).all(1)
-        pairs.append(np.column_stack([key[:-1, 3][same], key[1:, 3][same]]))
+        cells -= cells.min(0)
+        place = np.ravel_multi_index(cells.T, tuple(cells.max(0) + 1))
+        cell, mine = np.divmod(np.unique(place * len(clouds) + owner), len(clouds))
+        same = cell[1:] == cell[:-1]
+        pairs.append(np.column_stack([mine[:-1][same], mine[1:][same]]))
     first, second = np.concatenate(pairs).T
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(clouds), len(clouds)))
     return connected_components(graph, directed=False)[1]
@@ -250,7 +252,7 @@ def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
 def _translations(
     scene: Any, points: Mapping[str, np.ndarray], names: list[str], room: np.ndarray, axis: int
 ) -> np.ndarray | None:
-    """(2, 3) where a group can slide: over what it stands on, or along the wall it hangs on, clear of everything else.
+    """(2, 3) where a group can slide: over what it stands on, along the wall or ceiling it hangs on, clear of all else.
 
     None if nothing carries it.
     """
@@ -285,9 +287,13 @@ def _translations(
     ring[max(r0 - 2, 0) : r1 + 3, max(c0 - 2, 0) : c1 + 3] = True
     ring &= ~under & ~outside  # just around its feet: below them, rays would meet itself
     result = np.zeros((2, 3))
+    blocked[first[0] : last[0] + 1, first[1] : last[1] + 1] = False
     if ring.any() and carried[ring].mean() > 0.5:
-        blocked[first[0] : last[0] + 1, first[1] : last[1] + 1] = False
         steps = _grow(blocked | outside | (~carried & ~under), first, last, int(reach / cell))
+        result[:, b], result[:, c] = steps[:, 0] * cell, steps[:, 1] * cell
+        return result
+    if box[1, axis] > room[1, axis] - 3 * cell and box[1, axis] - box[0, axis] < 0.5 * height:  # a lamp on the ceiling
+        steps = _grow(blocked | outside, first, last, int(reach / 3 / cell))
         result[:, b], result[:, c] = steps[:, 0] * cell, steps[:, 1] * cell
         return result
     thin = min((b, c), key=lambda k: box[1, k] - box[0, k])
