@@ -26,8 +26,9 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock, compare
 from nlt.evaluation.frames import Frames
+from nlt.evaluation.gallery import Shown, worst_pixels
 from nlt.evaluation.report import draw
-from nlt.evaluation.results import load, write_rows
+from nlt.evaluation.results import load, write_images, write_rows
 from nlt.models.module import RenderingModule
 from nlt.paths import CONFIGS, PROJECT
 
@@ -442,7 +443,15 @@ def test_interval_is_of_the_views(made):
 def test_drawing_again_changes_no_byte(made, tmp_path):
     """Elsewhere, too, without anything but the directory."""
     files = {path.name: path.read_bytes() for path in made.directory.iterdir() if path.is_file()}
-    assert {"table.csv", "table.md", "table.tex", "claims.md", "claims.json", "speed_accuracy.svg"} <= set(files)
+    assert {
+        "table.csv",
+        "table.md",
+        "table.tex",
+        "claims.md",
+        "claims.json",
+        "speed_accuracy.svg",
+        "failures.md",
+    } <= set(files)
     copy = shutil.copytree(made.directory, tmp_path / "copy")
     for name in set(files) - {"runs.csv", "views.csv", "manifest.json"}:
         (copy / name).unlink()
@@ -464,3 +473,40 @@ def test_results_that_cannot_be_read(made, tmp_path, capfd, file, content):
     assert main(["report", str(copy)]) == 2
     error = capfd.readouterr().err
     assert error.startswith(f"nlt: error: {copy / file}: ") and error.count("\n") == 1
+
+
+def test_causes_of_failures(tmp_path):
+    """A made-up room of two walls: a mirror, a thing near the camera, a shadow's edge, and a view without a light."""
+    albedo = np.full((2, 3, 40, 40), 0.5)
+    depth = np.full((2, 1, 40, 40), 4.0)
+    light = np.full((2, 3, 40, 40), 0.4)
+    albedo[:, :, 2:8, 2:8] = 0  # mirror
+    depth[:, :, 30:38, 2:8] = 1.0  # near
+    light[:, :, :, 20:] = 0.1  # shadow
+    make_results(tmp_path, {"cnn": {"mse": 0.1}}, "table2", images=True)
+    view = np.arange(2)
+    write_images(tmp_path, "reference", radiance=light, exposure=np.ones(2, np.float32), view=view)
+    write_images(tmp_path, "noisy", radiance=light)
+    normal = np.zeros_like(albedo)
+    write_images(tmp_path, "gbuffer", albedo=albedo, normal=normal, depth=depth, light_in_view=np.array([True, False]))
+    wrong = light.copy()
+    wrong[0, :, 3:7, 3:7] += 0.3  # in the mirror of the first view
+    wrong[1, :, 10:28, 30:38] += 0.3  # anywhere in the second
+    write_images(tmp_path, "cnn", radiance=wrong)
+    images = Shown.load(load(tmp_path))
+    causes = images.causes
+    assert np.array_equal(causes["mirror or glass"], (albedo == 0).any(1))
+    assert np.array_equal(causes["near camera"], depth[:, 0] == 1)
+    edge = causes["shadow edge"]
+    assert edge[:, 10:28, 18:22].all() and not edge[:, :, :17].any() and not edge[:, :, 23:].any()
+    assert causes["light not in view"][1].all() and not causes["light not in view"][0].any()
+    assert not causes["none of these"][1].any() and causes["none of these"][0, 15, 30]
+    worst = worst_pixels(images, "cnn")
+    assert np.array_equal(worst, (wrong != light).any(1)) and worst.sum() == 16 + 144
+    draw(tmp_path)
+    with (tmp_path / "failures.csv").open(newline="") as file:
+        share = {row["cause"]: float(row["share_of_worst"]) for row in csv.DictReader(file)}
+    assert share["mirror or glass"] == pytest.approx(16 / 160) and share["light not in view"] == pytest.approx(
+        144 / 160
+    )
+    assert f"| {16 / 160:.1%} | 0.0% | 0.0% | {144 / 160:.1%} | 0.0% |" in (tmp_path / "failures.md").read_text()

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import yaml
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, default_collate
 
 from nlt import training
 from nlt.data.dataset import LightTransportDataset
@@ -41,8 +41,9 @@ from nlt.evaluation.results import (
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.jackknife import fid_and_kid_without
-from nlt.models.method import Method
-from nlt.models.module import RenderingModule
+from nlt.models.method import Batch, Method
+from nlt.models.module import PROJECTION, RenderingModule
+from nlt.models.projection import visible_pixels
 from nlt.paths import CONFIGS, find_config
 from nlt.training import newest_checkpoint
 
@@ -291,7 +292,17 @@ class Evaluation:
         view = np.array(self.shown)
         write_images(directory, "reference", radiance=reference, exposure=stack["exposure"], view=view)
         write_images(directory, "noisy", radiance=stack["noisy"])
-        write_images(directory, "gbuffer", **{name: stack[name] for name in ("albedo", "normal", "depth")})
+        buffers = {name: stack[name] for name in ("albedo", "normal", "depth")}
+        write_images(directory, "gbuffer", **buffers, light_in_view=self._light_in_view(samples))
+
+    @staticmethod
+    def _light_in_view(samples: list[Batch]) -> np.ndarray:
+        """(V,) bool: a point that emits light is seen in the sample's image."""
+        batch = default_collate(samples)
+        camera = {name: batch[name] for name in PROJECTION}
+        emits = batch["point_visible"] & (batch["point_emission"] > 0).any(-1)
+        pixels = visible_pixels(batch["point_position"], emits, **camera)
+        return (pixels < batch["depth"][0].numel()).any(1).numpy()
 
     @torch.inference_mode()
     def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:

@@ -10,10 +10,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
+from matplotlib.patheffects import withStroke
 from torch import Tensor
 
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import Results
+from nlt.evaluation.results import OK, Results
 from nlt.evaluation.tables import heading
 from nlt.metrics.display import display
 from nlt.metrics.quantities import METRICS
@@ -25,13 +26,15 @@ import matplotlib.pyplot as plt
 
 matplotlib.rcParams["svg.hashsalt"] = "nlt"  # the same drawing gives the same bytes
 
-_INCH = 1.1  # of an image in samples.png
+_INCH, _TITLE = 1.1, 0.35  # of an image in a grid, and above it
 _ROWS = 6  # views in samples.png
 # The supplementary's six panels, and two.
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 # Okabe and Ito's colours, which the colour-blind tell apart; markers and dashes for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _MARKERS, _DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
+_CURVES = ("0.3", "#8C510A", "#000000")
+_HALO = [withStroke(linewidth=1.5, foreground="white")]
 
 
 def draw_samples(results: Results) -> None:
@@ -46,15 +49,30 @@ def draw_samples(results: Results) -> None:
             columns[label(method)] = found["radiance"]
     columns["Reference"] = reference["radiance"]
     rows = np.unique(np.linspace(0, len(noisy["radiance"]) - 1, _ROWS).round().astype(int))
-    size = (_INCH * len(columns), _INCH * len(rows))
-    figure, axes = plt.subplots(len(rows), len(columns), figsize=size, squeeze=False)
-    for column, (name, images) in enumerate(columns.items()):
+    figure, axes = grid(len(rows), list(columns))
+    for column, images in enumerate(columns.values()):
         for row, view in enumerate(rows):
             axes[row][column].imshow(shown(images[view], reference["exposure"][view]), interpolation="nearest")
-            axes[row][column].set_axis_off()
-        axes[0][column].set_title(name.replace(" (", "\n("), fontsize=7)
-    figure.subplots_adjust(0.002, 0.002, 0.998, 1 - 0.35 / size[1], 0.02, 0.02)
-    figure.savefig(results.directory / "samples.png", dpi=150)
+    save(figure, results, "samples", ("png",))
+
+
+def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
+    """A figure for images side by side, and its axes (rows, columns); columns have titles. `bottom`: inches free."""
+    size = (_INCH * len(columns), _INCH * rows + _TITLE + bottom)
+    figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, name in zip(axes[0], columns, strict=True):
+        axis.set_title(name.replace(" (", "\n("), fontsize=7)
+    figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - _TITLE / size[1], 0.02, 0.02)
+    return figure, axes
+
+
+def save(figure: plt.Figure, results: Results, name: str, kinds: tuple[str, ...] = ("png", "svg")) -> None:
+    """Into the results' directory; the same figure gives the same bytes."""
+    for kind in kinds:
+        metadata = {"png": {"Software": None}, "svg": {"Date": None}}[kind]
+        figure.savefig(results.directory / f"{name}.{kind}", dpi=150, metadata=metadata)
     plt.close(figure)
 
 
@@ -143,15 +161,19 @@ def draw_speed_accuracy(results: Results) -> None:
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
         for k, (name, members) in enumerate(curves.items()):
             found = [m for m in members if m in at]
-            style = {"color": ("0.35", "0.55", "0.1")[k % 3], "ls": _DASHES[k % 4], "marker": "x+."[k % 3]}
+            style = {"color": _CURVES[k % len(_CURVES)], "ls": _DASHES[k % 4], "marker": "x+."[k % 3]}
             _plot(axis, results, key, found, at, name, style)
-            for m in found:
-                part = label(m).partition("(")[2].rstrip(")")
-                axis.annotate(part, at[m], (3, 4), textcoords="offset points", fontsize=7, color=style["color"])
+            for number, m in enumerate(found):
+                part = label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
+                axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
+                              fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
         for k, m in enumerate(m for m in points if m in at):
             style = {"color": _COLOURS[k % len(_COLOURS)], "ls": "", "marker": _MARKERS[k % len(_MARKERS)]}
-            _plot(axis, results, key, [m], at, label(m), style)
+            _plot(axis, results, key, [m], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3})
         axis.set_xscale("log")
+        axis.margins(0.09, 0.12)
+        narrow = len(at) and max(x for x, _ in at.values()) < 30 * min(x for x, _ in at.values())
+        axis.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5) if narrow else (1,)))
         axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         axis.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
         axis.set_xlabel("time per frame (ms)", fontsize=8)
@@ -159,11 +181,9 @@ def draw_speed_accuracy(results: Results) -> None:
         axis.tick_params(labelsize=8)
         axis.grid(alpha=0.3)
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), fontsize=8, frameon=False)
-    figure.tight_layout(rect=(0, 0.04 + 0.03 * math.ceil(len(labels) / 5), 1, 1))
-    for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-        figure.savefig(results.directory / f"speed_accuracy.{kind}", dpi=150, metadata=metadata)
-    plt.close(figure)
+    figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0.01 + 0.03 * math.ceil(len(labels) / 6), 1, 1))
+    save(figure, results, "speed_accuracy")
 
 
 def _plot(
@@ -192,15 +212,17 @@ def _bar(results: Results, method: str, key: str, mean: float) -> tuple[float, f
 
 def _curves(results: Results) -> dict[str, list[str]]:
     """Classes with several methods that path trace: the methods, by what they are called, the cheapest first."""
-    families: dict[str, dict[str, float]] = {}
+    families: dict[str, dict[str, tuple[float, float]]] = {}
     for run in results.runs:
-        if run.get("spp") and run["status"] == "ok":
-            families.setdefault(run["family"], {})[run["method"]] = run["spp"] * run["pixel_fraction"]
-    return {
-        label(next(iter(members))).partition(" (")[0]: sorted(members, key=members.__getitem__)
-        for members in families.values()
-        if len(members) > 1
-    }
+        if run["status"] == OK and run["spp"]:
+            families.setdefault(run["family"], {})[run["method"]] = (run["spp"], run["pixel_fraction"])
+    curves = {}
+    for members in families.values():
+        if len(members) > 1:
+            varied = "spp" if len({spp for spp, _ in members.values()}) > 1 else "pixels traced"
+            name = f"{label(next(iter(members))).partition(' (')[0]} ({varied})"
+            curves[name] = sorted(members, key=lambda m: math.prod(members[m]))
+    return curves
 
 
 def _pareto_front(at: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:

@@ -1,0 +1,177 @@
+"""Pictures of what the methods get wrong, from results on disk: insets, error maps, and what is in the worst pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import matplotlib
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from nlt.data.files import write_bytes
+from nlt.evaluation.figures import grid, save, shown
+from nlt.evaluation.paper import label
+from nlt.evaluation.results import Results, write_rows
+
+import matplotlib.pyplot as plt  # isort: skip  after figures.py has chosen the backend
+
+_VIEWS = 3  # in qualitative.png
+_INSET = 4  # a side of the image over a side of the inset
+WORST = 0.1  # of a method's pixels
+# What the supplementary names as hard, in the order in which a pixel is put down to one: colours of Okabe and Ito.
+CAUSES = {
+    "mirror or glass": "#0072B2",
+    "near camera": "#E69F00",
+    "shadow edge": "#D55E00",
+    "light not in view": "#CC79A7",
+    "none of these": "#999999",
+}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The shown views of results as displayed: (V, H, W, 3) each."""
+
+    results: Results
+    reference: np.ndarray
+    noisy: np.ndarray
+    methods: dict[str, np.ndarray]
+
+    @classmethod
+    def load(cls, results: Results) -> Shown | None:
+        """None where the images are on another machine."""
+        reference = results.images("reference")
+        if reference is None:
+            return None
+        finished = [m for m in results.methods if results.runs_of(m)]
+        stored = {name: results.images(name) for name in ("noisy", *finished)}
+        images = {
+            name: np.stack([shown(r, e) for r, e in zip(arrays["radiance"], reference["exposure"], strict=True)])
+            for name, arrays in {"reference": reference, **stored}.items()
+            if arrays is not None
+        }
+        return cls(results, images.pop("reference"), images.pop("noisy"), images)
+
+    def error(self, method: str) -> np.ndarray:
+        """(V, H, W): root of the mean over RGB of the squared difference, of what is displayed."""
+        return np.sqrt(np.square(self.methods[method] - self.reference).mean(-1))
+
+    @cached_property
+    def scale(self) -> float:
+        """The error that is drawn brightest, one for all methods and views."""
+        return float(np.quantile([self.error(m) for m in self.methods], 0.99)) or 1.0
+
+    @cached_property
+    def causes(self) -> dict[str, np.ndarray]:
+        """For each of `CAUSES` the pixels (V, H, W) that it applies to; several may apply to one."""
+        buffers = self.results.images("gbuffer")
+        assert buffers is not None
+        buffers = {name: array.astype(np.float32) for name, array in buffers.items()}
+        albedo, normal, depth = buffers["albedo"].mean(1), buffers["normal"], buffers["depth"][:, 0]
+        hit = depth > 0
+        luminance = self.reference.mean(-1)
+        near = hit & (depth < 0.5 * np.median(depth[hit])) if hit.any() else hit
+        mirror = hit & (albedo == 0) & (luminance < 1)  # a lamp has no albedo either
+        dark = ~buffers["light_in_view"].astype(bool)
+        causes = {
+            "mirror or glass": mirror,
+            "near camera": near,
+            "shadow edge": _shadow_edges(luminance, albedo, normal, depth),
+            "light not in view": np.broadcast_to(dark[:, None, None], hit.shape),
+        }
+        return causes | {"none of these": ~np.any(list(causes.values()), axis=0)}
+
+
+def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Where light changes, by more than a quarter over two pixels, on a surface that does not: (V, H, W)."""
+    light = np.log(uniform_filter(luminance, (0, 3, 3)) + 0.02)
+    edges = np.zeros(depth.shape, bool)
+    for axis in (1, 2):
+        step = lambda x, axis=axis: np.abs(np.roll(x, -1, axis) - np.roll(x, 1, axis))
+        smooth = (step(albedo) < 0.02) & (step(depth) < 0.1 * depth)
+        smooth &= np.stack([step(normal[:, k]) for k in range(3)]).max(0) < 0.1
+        smooth[:, [0, -1]] = smooth[:, :, [0, -1]] = False
+        edges |= smooth & (step(light) > 0.25)
+    return edges
+
+
+def draw_qualitative(images: Shown) -> None:
+    """qualitative.png: per view the images, an inset where the trained methods err most, and their error maps."""
+    trained = [m for m in images.methods if np.isfinite(images.results.mean(m, "train_s"))] or list(images.methods)
+    if not trained:
+        return
+    errors = {m: images.error(m) for m in images.methods}
+    size = images.reference.shape[1]
+    side = max(size // _INSET, 4)
+    columns = ["Teaching input", *map(label, images.methods), "Reference"]
+    views = np.unique(np.linspace(0, len(images.reference) - 1, _VIEWS).round().astype(int))
+    figure, axes = grid(3 * len(views), columns)
+    for k, view in enumerate(views):
+        mean = uniform_filter(np.mean([errors[m][view] for m in trained], axis=0), side, mode="nearest")
+        inside = mean[side // 2 : size - side // 2, side // 2 : size - side // 2]
+        top, left = np.unravel_index(inside.argmax(), inside.shape)
+        crop = (slice(top, top + side), slice(left, left + side))
+        row = [images.noisy[view], *(m[view] for m in images.methods.values()), images.reference[view]]
+        for column, image in enumerate(row):
+            axes[3 * k][column].imshow(image, interpolation="nearest")
+            frame = plt.Rectangle((left - 0.5, top - 0.5), side, side, fill=False, ec="#D55E00", lw=0.8)
+            axes[3 * k][column].add_patch(frame)
+            axes[3 * k + 1][column].imshow(image[crop], interpolation="nearest")
+        for column, method in enumerate(images.methods, 1):
+            drawn = axes[3 * k + 2][column].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
+    bar = axes[-1][-1].inset_axes((0.1, 0.1, 0.15, 0.8))
+    figure.colorbar(drawn, cax=bar).ax.tick_params(labelsize=5)
+    axes[-1][-1].text(0.65, 0.5, "error, one scale", fontsize=5, rotation=90, va="center", ha="center",
+                      transform=axes[-1][-1].transAxes)  # fmt: skip
+    save(figure, images.results, "qualitative", ("png",))
+
+
+def worst_pixels(images: Shown, method: str) -> np.ndarray:
+    """(V, H, W) bool: the tenth of a method's pixels with the largest error."""
+    error = images.error(method)
+    return error > np.quantile(error, 1 - WORST)
+
+
+def draw_failures(images: Shown) -> None:
+    """failures.png, .csv and .md: each method's worst tenth of the pixels, and what is in them, counted.
+
+    The picture shows the view with most of them: prediction, reference, error, and the worst pixels in the colour of
+    the first cause that applies.
+    """
+    rows = []
+    figure, axes = grid(4, [label(m) for m in images.methods], bottom=0.3)
+    colours = np.array([matplotlib.colors.to_rgb(colour) for colour in CAUSES.values()])
+    first = np.argmax([images.causes[cause] for cause in CAUSES], axis=0)
+    for column, method in enumerate(images.methods):
+        worst = worst_pixels(images, method)
+        view = int(worst.sum((1, 2)).argmax())
+        overlay = np.where(worst[view][..., None], colours[first[view]], 0.25 * images.reference[view])
+        error = images.error(method)[view]
+        pictures = (images.methods[method][view], images.reference[view], error, overlay)
+        for axis, picture in zip(axes[:, column], pictures, strict=True):
+            axis.imshow(picture, interpolation="nearest", cmap="magma", vmin=0, vmax=images.scale)
+        for cause, mask in images.causes.items():
+            rows.append({
+                "method": method, "cause": cause, "pixels": int((worst & mask).sum()),
+                "share_of_worst": float(mask[worst].mean()) if worst.any() else 0.0, "share_of_all": float(mask.mean()),
+            })  # fmt: skip
+    handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in CAUSES.values()]
+    figure.legend(handles, CAUSES, loc="lower center", ncols=len(CAUSES), fontsize=7, frameon=False)
+    save(figure, images.results, "failures", ("png",))
+    write_rows(images.results.directory / "failures.csv", rows)
+    write_bytes(images.results.directory / "failures.md", _failures_markdown(images, rows).encode())
+
+
+def _failures_markdown(images: Shown, rows: list[dict]) -> str:
+    share = {(row["method"], row["cause"]): row["share_of_worst"] for row in rows}
+    everywhere = {row["cause"]: row["share_of_all"] for row in rows}
+    lines = [
+        "# What is in the worst pixels", "",
+        f"Of each method's worst tenth of the pixels in {len(images.reference)} test views, the share to which a cause "
+        "applies; several may. Above what it is in all pixels, the cause goes with errors.", "",
+        f"| method | {' | '.join(CAUSES)} |", "|---|" + "---:|" * len(CAUSES),
+        *(f"| {label(m)} | " + " | ".join(f"{share[m, c]:.1%}" for c in CAUSES) + " |" for m in images.methods),
+        "| all pixels | " + " | ".join(f"{everywhere.get(c, 0):.1%}" for c in CAUSES) + " |", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
