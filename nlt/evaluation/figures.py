@@ -144,7 +144,8 @@ def draw_speed_accuracy(results: Results) -> None:
     Methods of one class that path trace are a curve, labelled by their pixels or samples per pixel. Bars are the
     standard deviation over seeds, with one seed the 95% interval over test views. The grey line is the Pareto front.
     """
-    panels = [key for key in _PANELS if any(math.isfinite(results.mean(m, key)) for m in results.methods)]
+    timed = [m for m in results.methods if math.isfinite(results.mean(m, "time_per_frame_s"))]
+    panels = [key for key in _PANELS if any(math.isfinite(results.mean(m, key)) for m in timed)]
     if not panels:
         return
     columns = math.ceil(len(panels) / 2)
@@ -155,8 +156,8 @@ def draw_speed_accuracy(results: Results) -> None:
     in_curves = {method for members in curves.values() for method in members}
     points = [method for method in results.methods if method not in in_curves]
     for axis, key in zip(axes.flat, panels, strict=False):
-        at = {m: (1e3 * results.mean(m, "time_per_frame_s"), results.mean(m, key)) for m in results.methods}
-        at = {m: place for m, place in at.items() if all(map(math.isfinite, place))}
+        at = {m: (1e3 * results.mean(m, "time_per_frame_s"), results.mean(m, key)) for m in timed}
+        at = {m: place for m, place in at.items() if math.isfinite(place[1])}
         front = _pareto_front(at, METRICS[key].direction)
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
         for k, (name, members) in enumerate(curves.items()):
@@ -172,7 +173,7 @@ def draw_speed_accuracy(results: Results) -> None:
             _plot(axis, results, key, [m], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3})
         axis.set_xscale("log")
         axis.margins(0.09, 0.12)
-        narrow = len(at) and max(x for x, _ in at.values()) < 30 * min(x for x, _ in at.values())
+        narrow = max(x for x, _ in at.values()) < 30 * min(x for x, _ in at.values())
         axis.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5) if narrow else (1,)))
         axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         axis.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
