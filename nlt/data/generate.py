@@ -147,12 +147,17 @@ def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int,
         path = directory / shard.name
         if path.exists():  # another run has been faster
             tick(shard.stop - shard.start)
-            continue
-        samples = []
-        for index in range(shard.start, shard.stop):
-            samples.append(render.sample(shard.split, index))
-            tick(1)
-        write_shard(path, samples)
+        else:
+            render_shard(render, path, shard, tick)
+
+
+def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Callable[[int], None]) -> None:
+    """Render and write the samples of a shard."""
+    samples = []
+    for index in range(shard.start, shard.stop):
+        samples.append(render.sample(shard.split, index))
+        tick(1)
+    write_shard(path, samples)
 
 
 def _measure(spec: DatasetSpec) -> tuple[float, float]:

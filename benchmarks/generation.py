@@ -1,0 +1,242 @@
+"""How fast is generation? Against a bare loop of `mi.render` that traces the same rays, in one run on this machine.
+
+    python benchmarks/generation.py                  # writes results/benchmarks/generation.json and .md
+
+Same rays: for every sample the objects move (`Scene.set_state`, which is Mitsuba's own `params.update`), then come a
+path-traced image at 1 spp, another at 4, for evaluated samples two at 64; one ray a pixel for depth, normal and albedo
+(the `aov` integrator); one ray a photon from the emitters (`scene.sample_emitter_ray`). Same scene, states, views,
+resolution, variant, threads. The bare loop gets its states and views for nothing, keeps its images no longer than it
+takes to copy them to numpy, and writes nothing; generation samples states and views, checks, stacks, checksums, writes
+and syncs. Both run in the same processes, side by side as in generation, in turns of one shard, so that whatever else
+the machine does slows both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import shlex
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+
+from nlt.data.engines import Process, cores
+from nlt.data.generate import generate, render_shard
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec, Shard
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.paths import PROJECT
+from nlt.scenes.assembly import load_source
+from nlt.scenes.camera import Camera
+from nlt.scenes.description import MOVING_LIGHT
+
+SPLITS = ("train", "test")
+
+
+class Bare:
+    """A plain loop of Mitsuba's own calls; no frozen kernels, no code of ours but moving the objects."""
+
+    def __init__(self, render: SampleRenderer) -> None:
+        self.spec, self.scene = render.spec, render.scene
+        self.path = render.renderer.integrator
+        self.aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,normal:sh_normal,albedo:albedo"})
+        size = render.spec.resolution
+        film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+        fov = render.description.fov
+        self.sensor = mi.load_dict({"type": "perspective", "near_clip": 1e-4, "fov": fov, "film": film})
+        self.view = mi.traverse(self.sensor)
+
+    def sample(self, state: Any, camera: Camera, split: str, seed: int) -> None:
+        self.scene.set_state(state)
+        to_world = np.linalg.inv(camera.world_to_view.astype(float))
+        to_world[:3, 3] *= self.scene.description.units_per_metre
+        self.view["to_world"] = mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1, 1, 1]))
+        self.view.update()
+        references = [] if split == "train" else [self.spec.reference_spp] * 2
+        for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, *references)):
+            np.array(self._render(self.path, spp, seed * 8 + k))
+        np.array(self._render(self.aov, 1, seed))
+        self._photons(seed)
+
+    def _render(self, integrator: Any, spp: int, seed: int) -> Any:
+        return mi.render(self.scene.mi_scene, sensor=self.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
+
+    def _photons(self, seed: int) -> None:
+        count = self.spec.photons if dr.is_jit_v(mi.Float) else 1
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, count)
+        for _ in range(self.spec.photons // count):
+            ray, weight, _ = self.scene.mi_scene.sample_emitter_ray(
+                mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True
+            )
+            hit = self.scene.mi_scene.ray_intersect(ray)
+            for value in (ray.o, ray.d, weight, hit.p, hit.is_valid()):
+                np.array(value)
+
+
+def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[str, Any]:
+    """Seconds of every turn of one shard, by (split, who), and kernels compiled after the first round."""
+    render = SampleRenderer(spec, 0, max(1, cores() // barrier.parties))
+    bare, compiled = Bare(render), {"bare": 0, "generation": 0}
+    seconds: dict[str, list[float]] = {f"{split} {who}": [] for split in SPLITS for who in compiled}
+    for turn in range(rounds + 1):
+        for split in SPLITS:
+            shard = spec.shard(split, 0, turn * spec.shard_size)
+            views = []
+            for index in range(shard.start, shard.stop):
+                camera = render.place(split, index)
+                views.append((render.scene.state, camera))
+
+            def plain(shard: Shard = shard, views: list = views) -> None:
+                for k, (state, camera) in enumerate(views):
+                    bare.sample(state, camera, shard.split, shard.start + k)
+
+            def ours(shard: Shard = shard) -> None:
+                render_shard(render, Path(folder) / f"{id(render)}.safetensors", shard, lambda _: None)
+
+            for who, work in (("bare", plain), ("generation", ours)):
+                barrier.wait()
+                took, kernels = _timed(work)
+                if turn:  # the first one warms up
+                    seconds[f"{split} {who}"].append(took / (shard.stop - shard.start))
+                    compiled[who] += kernels
+    return {"seconds": seconds, "compiled": compiled}
+
+
+def _timed(work: Callable[[], None]) -> tuple[float, int]:
+    """Seconds, and kernels that were compiled meanwhile."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, dr.is_jit_v(mi.Float)):
+        if dr.is_jit_v(mi.Float):
+            dr.kernel_history_clear()
+        start = time.perf_counter()
+        work()
+        took = time.perf_counter() - start
+        kernels = dr.kernel_history((dr.KernelType.JIT,)) if dr.is_jit_v(mi.Float) else []
+    return took, sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in kernels)
+
+
+def moving(spec: DatasetSpec, rounds: int) -> dict[str, float]:
+    """Median seconds to move every object, until a ray sees it: our instances, and Mitsuba's scene as it is loaded."""
+    render = SampleRenderer(spec, 0)
+    scene, plain = render.scene, load_source(render.description)
+    parameters = mi.traverse(plain)
+    keys = {shape: f"{shape}.vertex_positions" for m in scene.movables if m.name != MOVING_LIGHT for shape in m.shapes}
+    parameters.keep(sorted(keys.values()))
+    rest = {shape: np.array(parameters[key]).reshape(-1, 3) for shape, key in keys.items()}
+    units = render.description.units_per_metre
+    seconds: dict[str, list[float]] = {"instances": [], "meshes": []}
+    states = replace(spec, train=rounds, test=0).states(0)["train"]
+
+    def see(mi_scene: Any) -> None:
+        np.array(mi_scene.ray_test(mi.Ray3f(mi.Point3f(0, 1, 0), mi.Vector3f(0, 0, 1))))
+
+    for state in states:
+        start = time.perf_counter()
+        scene.set_state(state)
+        see(scene.mi_scene)
+        seconds["instances"].append(time.perf_counter() - start)
+        start = time.perf_counter()
+        for movable, translation in zip(scene.movables, state.translation, strict=True):
+            if movable.name != MOVING_LIGHT:
+                for shape in movable.shapes:
+                    moved = (rest[shape] + translation * units).astype(np.float32).ravel()
+                    parameters[keys[shape]] = mi.Float(moved) if dr.is_jit_v(mi.Float) else moved.tolist()
+        parameters.update()
+        see(plain)
+        seconds["meshes"].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Generation against a bare loop of mi.render.")
+    parser.add_argument("--scene", default="living_room")
+    parser.add_argument("--experiment", default="moving_lights")
+    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--shard", type=int, default=16, help="samples in a turn")
+    parser.add_argument("--end-to-end", type=int, default=512, help="training samples of the whole command")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=PROJECT / "results" / "benchmarks")
+    options = parser.parse_args()
+    manifest = origin() | {"command": shlex.join(["python", "benchmarks/generation.py", *sys.argv[1:]])}
+    count = options.shard * (options.rounds + 1)
+    spec = DatasetSpec(
+        [options.scene],
+        options.experiment,
+        options.resolution,
+        train=count,
+        val=0,
+        test=count,
+        shard_size=options.shard,
+    )
+    manifest |= surroundings(torch.device("cpu"))
+    barrier = multiprocessing.get_context("spawn").Barrier(options.workers)
+    with tempfile.TemporaryDirectory() as folder:
+        parts = [
+            Process(contest, replace(spec, seed=k), options.rounds, barrier, folder) for k in range(options.workers)
+        ]
+        results = [part.result() for part in parts]
+        whole = replace(spec, train=options.end_to_end, test=0, shard_size=64)
+        start = time.perf_counter()
+        generate(whole, folder, workers=options.workers)
+        took = time.perf_counter() - start
+    rates = {
+        key: options.workers / statistics.median(s for result in results for s in result["seconds"][key])
+        for key in results[0]["seconds"]
+    }
+    report = {
+        "samples_per_second": rates,
+        "ratio": {split: rates[f"{split} generation"] / rates[f"{split} bare"] for split in SPLITS},
+        "kernels_compiled_after_the_first_turn": {
+            who: sum(result["compiled"][who] for result in results) for who in results[0]["compiled"]
+        },
+        "end_to_end": {"samples": options.end_to_end, "seconds": took, "samples_per_second": options.end_to_end / took},
+        "seconds_to_move_all_objects": Process(moving, spec, 20).result(),
+        "options": {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items()},
+        "turns": [result["seconds"] for result in results],
+        "manifest": manifest,
+    }
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "generation.json").write_text(json.dumps(report, indent=1) + "\n")
+    text = markdown(report)
+    (options.out / "generation.md").write_text(text)
+    print(text)
+
+
+def markdown(report: dict[str, Any]) -> str:
+    options, rates, moved = report["options"], report["samples_per_second"], report["seconds_to_move_all_objects"]
+    rate = lambda split, who: f"{rates[f'{split} {who}']:.2f}"
+    rows = [f"| {s} | {rate(s, 'bare')} | {rate(s, 'generation')} | {report['ratio'][s]:.2f} |" for s in SPLITS]
+    whole, compiled = report["end_to_end"], report["kernels_compiled_after_the_first_turn"]
+    return "\n".join([
+        f"Generation of {options['scene']}, {options['experiment']}, {options['resolution']}x{options['resolution']}, "
+        f"{options['workers']} processes; {report['manifest']['device']}, {report['manifest']['mitsuba_variant']}.",
+        "",
+        "| samples per second | bare loop of mi.render | generation | ratio |",
+        "|---|---:|---:|---:|",
+        *rows,
+        "",
+        f"Whole command, starting up included: {whole['samples']} training samples in {whole['seconds']:.1f} s, "
+        f"{whole['samples_per_second']:.2f} per second. Kernels compiled after the first turn: generation "
+        f"{compiled['generation']}, bare loop {compiled['bare']}. To move all objects until a ray sees them: instances "
+        f"{1e3 * moved['instances']:.1f} ms, the scene's meshes as loaded {1e3 * moved['meshes']:.1f} ms.",
+        "",
+        f"`{report['manifest']['command']}`, medians over turns of {options['shard']} samples; what the rays are: see "
+        "benchmarks/generation.py.",
+        "",
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
