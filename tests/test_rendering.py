@@ -1,6 +1,7 @@
 """Rendering against plain Mitsuba scenes, float64 geometry and analytic light, each by a statistical test."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -152,6 +153,32 @@ def test_emitter_that_moves(tmp_path, movable):
         if present:
             flux = photons["photon_flux"].mean(1)
             assert flux.max() < 1.5 * flux.min(), "photons carry about equal power"
+
+
+def test_textured_light(tmp_path):
+    """A light whose radiance is a texture of one colour is that of the plain light: images and photons."""
+    plain = write_room(tmp_path / "plain")
+    file = write_room(tmp_path / "textured")
+    colour = np.broadcast_to(np.float32(LIGHT["radiance"]), (4, 4, 3))
+    mi.Bitmap(np.ascontiguousarray(colour)).write(str(file.with_name("light.exr")))
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * LIGHT["size"] / 2
+    lines = [f"v {x} {LIGHT['height']} {z}" for x, z in corners] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    file.with_name("lamp.obj").write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4"]))
+    xml = file.with_name("scene.xml")
+    text = xml.read_text().replace('type="ply" id="lamp"', 'type="obj" id="lamp"').replace("lamp.ply", "lamp.obj")
+    text = re.sub('<rgb name="radiance" value="[^"]*"/>', '<texture type="bitmap" name="radiance">'
+                  '<string name="filename" value="light.exr"/></texture>', text)  # fmt: skip
+    xml.write_text(text)
+
+    def rendered(file):
+        description = load_description(str(file))
+        renderer = Renderer(Scene(description, "fixed_lights"))
+        camera = sample_view(description, 8, np.random.default_rng(1))
+        return samples_of(renderer, camera, 64, range(8)), renderer.photons(2000, 0)["photon_flux"].sum(0)
+
+    (samples, flux), (expected, same) = map(rendered, (plain, file))
+    assert p_value(samples, expected.mean(0), expected.var(0, ddof=1) / len(expected)) > ALPHA
+    np.testing.assert_allclose(flux, same, rtol=1e-3)
 
 
 def test_sparse_pixels(renderer, demo, monkeypatch):
