@@ -26,16 +26,17 @@ def freeze(kernel: Callable) -> Callable:
     """
     if not is_jit():
         return kernel
-    frozen = dr.freeze(kernel)
+    run = dr.freeze(kernel)
 
     def call(**values: Any) -> Any:
-        if frozen.enabled:
+        nonlocal run
+        if run is not kernel:
             try:
-                return frozen(**values)
+                return run(**values)
             except RuntimeError as error:
                 if "record()" not in str(error):
                     raise
-                frozen.enabled = False
+                run = kernel
                 log.warning("rendering slowly: %s cannot be frozen (%s)", kernel.__name__, error.__cause__)
         return kernel(**values)
 
