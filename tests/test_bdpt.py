@@ -72,9 +72,10 @@ def lamp(x, y, z, half, *radiance):
 
 
 def room():
-    """Diffuse, closed."""
-    return {"walls": mesh(box(2, 2, 2), diffuse(0.7, 0.6, 0.5)), "crate": mesh(box(0.6, 0.8, 0.6, at=(-0.4, -0.6, 0)),
-            diffuse(0.3, 0.5, 0.8)), "lamp": lamp(0.2, 0.98, 0, 0.3, 5, 4, 3)}  # fmt: skip
+    """Diffuse, closed; the crate's shading normals are far from its faces'."""
+    walls, crate = mesh(box(2, 2, 2), diffuse(0.7, 0.6, 0.5)), box(0.9, 1, 0.9, at=(-0.3, -0.5, -0.3))
+    crate = mesh(crate, diffuse(0.3, 0.5, 0.8), smooth=True)
+    return {"walls": walls, "crate": crate, "lamp": lamp(0.2, 0.98, 0, 0.3, 5, 4, 3)}
 
 
 def materials():
@@ -103,6 +104,15 @@ def chamber():
     return {"walls": mesh(box(4, 2, 2), white), "lamp": lamp(-1.4, 0.9, 0.2, 0.3, 30, 27, 25),
             "wall": mesh(box(0.05, 2, 1.4, at=(-0.9, 0, -0.3)), white),
             "above": mesh(box(0.05, 0.4, 0.6, at=(-0.9, 0.8, 0.7)), white)}  # fmt: skip
+
+
+def lantern():
+    """A lamp in a coarse globe of frosted glass: light's way out differs from the camera's way in."""
+    globe = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
+    globe.apply_translation([-0.2, 0.1, -0.4])
+    frosted = mesh(globe, {"type": "roughdielectric", "alpha": 0.5}, smooth=True)
+    walls = mesh(box(2, 2, 2), diffuse(0.6, 0.5, 0.4))
+    return {"walls": walls, "globe": frosted, "lamp": lamp(-0.2, 0.2, -0.4, 0.2, 9, 8, 7)}
 
 
 def sky():
@@ -155,7 +165,7 @@ def agreement(ours, theirs):
     return stats.ttest_ind(ours[:, ~black], theirs[:, ~black], equal_var=False).pvalue.min() * (~black).sum()
 
 
-@pytest.mark.parametrize("parts", [room, materials, chamber, sky, points])
+@pytest.mark.parametrize("parts", [room, materials, lantern, chamber, sky, points])
 def test_agrees_with_path(parts):
     theirs = images(renderer_of(parts(), "path"), 0)
     ours = images(renderer_of(parts(), "bdpt"), 1000)
