@@ -8,6 +8,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -113,6 +114,7 @@ def world(tiny, tmp_path_factory, one_thread):
         made = World(folder=folder, config=config, frames=frames, tiny=tiny)
         made.rows = made.compare(out="out")
         made.measured = list(frames)
+        patch.setattr(compare, "draw", lambda directory: None)  # the pictures of the first are looked at
         yield made
 
 
@@ -508,3 +510,15 @@ def test_causes_of_failures(tmp_path):
         share = {row["cause"]: float(row["share_of_worst"]) for row in csv.DictReader(file)}
     assert share["mirror or glass"] == pytest.approx(0.1) and share["light not in view"] == pytest.approx(0.9)
     assert "| CNN only | 10.0% | 0.0% | 0.0% | 90.0% | 0.0% |" in (tmp_path / "failures.md").read_text()
+
+
+@pytest.mark.parametrize("name", paths.config_names("compare"))
+def test_every_comparison_names_what_there_is(name):
+    """Its data, scale and methods; without a list, every method that is not in a folder."""
+    found = compare.Comparison.load(name, None, None, None, seeds=3)
+    assert found.data.exists() and found.scale.exists() and found.seeds == [0, 1, 2]
+    assert all(Path(file).exists() for method in found.methods for file in found.configs(method))
+    if name in ("table1", "table2", "demo"):
+        assert set(found.methods) == methods()
+    trained = [method for method in found.methods if compare.untrained(method) is None]
+    assert len(found.jobs()) == 3 * len(trained) + len(found.methods) - len(trained)

@@ -12,6 +12,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from synthetic import POINTS, SCENES, synthetic_batch
 from torch.utils.data import DataLoader
 
+from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.errors import UserError
@@ -20,10 +21,10 @@ from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
+from nlt.paths import config_names, find_config
 
-ALL = sorted((Path(__file__).parents[1] / "configs/model").glob("*.yaml"))
-CONFIGS = [path for path in ALL if untrained(path.stem) is None]
-UNTRAINED = [path.stem for path in ALL if path not in CONFIGS]
+UNTRAINED = [name for name in config_names("model") if untrained(name)]
+CONFIGS = [find_config("model", name) for name in config_names("model") if name not in UNTRAINED]
 SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 
 
@@ -94,7 +95,7 @@ def test_bfloat16_autocast(method):
 def test_stages_are_those_of_the_inputs(method):
     photons = any(name.startswith("photon_") for name in method.inputs)
     stages = {
-        "gbuffer": "depth" in method.inputs,
+        "gbuffer": not {"depth", "normal"}.isdisjoint(method.inputs),
         "photons": photons,
         "path_tracing": method.pixel_fraction > 0,
     }
@@ -121,6 +122,24 @@ def test_splitting_the_photons():
             batch[name] = torch.cat([batch[name]] * 2, dim=1)
     batch["photon_flux"] = batch["photon_flux"] / 2
     torch.testing.assert_close(method(batch), expected)
+
+
+@pytest.mark.parametrize("number", range(1, 16))
+def test_ablation_of_inputs(number):
+    """Any combination: only what is chosen reaches the U-Net, and none of the rest is needed."""
+    chosen = {name: bool(number >> k & 1) for k, name in enumerate(INPUTS)}
+    method, batch = InputAblation(**chosen, embedding=5, **SIZE), synthetic_batch()
+    features = method.features({name: batch[name] for name in (*method.inputs, "scene")})
+    parts = dict(zip(INPUTS, (3, 5, 3, 3), strict=True))
+    assert features.shape[1] == method.feature_channels == sum(parts[name] for name in INPUTS if chosen[name])
+    if chosen["normal"] and chosen["ray_direction"]:
+        torch.testing.assert_close(features[:, -6:], torch.cat([batch["normal"], batch["view_direction"]], dim=1))
+    assert ("point_position" in method.inputs) == (chosen["position"] or chosen["point_features"])
+
+
+def test_ablation_without_inputs():
+    with pytest.raises(UserError, match=r"model\.init_args.*position.*ray_direction"):
+        InputAblation(**SIZE)
 
 
 def test_a_scale_without_class_path_is_merged(tmp_path):

@@ -44,7 +44,7 @@ from nlt.metrics.jackknife import fid_and_kid_without
 from nlt.models.method import Batch, Method
 from nlt.models.module import PROJECTION, RenderingModule
 from nlt.models.projection import visible_pixels
-from nlt.paths import CONFIGS, find_config
+from nlt.paths import CONFIGS, config_names, find_config
 from nlt.training import newest_checkpoint
 
 _KEYS = ("table", "data", "scale", "methods", "seed")
@@ -87,8 +87,9 @@ class Comparison:
             raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise UserError(f"{file}: seed: must be a whole number of at least 0, is {seed!r}")
-        known = sorted((path.stem for path in (CONFIGS / "model").glob("*.yaml")), key=order)
-        wanted = methods or content.get("methods") or known
+        known = sorted(config_names("model"), key=order)
+        # Those in folders belong to a comparison that names them.
+        wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
         for method in wanted:
             if method not in known:
                 raise UserError(f"{file}: methods: no method {method!r} in configs/model; known are {', '.join(known)}")
