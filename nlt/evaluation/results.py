@@ -3,7 +3,7 @@
 results/NAME/ holds
 
 - `manifest.json`: command, commit, device, versions, configs; `methods` in the table's order, `table` (the paper's,
-  or null), `n_test`, `seeds`, `shown` (the indices of the test views whose images are kept);
+  or null), `n_test`, `seeds`, `scenes`, `shown` (the indices of the test views whose images are kept);
 - `runs.csv`: a row per method and seed with every number as it was measured, by the keys of `QUANTITIES`; `status`
   is ok, diverged or failed, and `message` says why; `family` is the method's class, `spp` and `pixel_fraction` what
   of a frame it path traces;
@@ -13,7 +13,7 @@ results/NAME/ holds
   `images/reference.npz` also has `exposure` (V,) and `view` (V,); `images/noisy.npz` is the teaching input, and
   `images/gbuffer.npz` has `albedo` and `normal` (V, 3, H, W), `depth` (V, 1, H, W), `light_in_view` (V,) bool.
 
-Tables, figures and claims are made from these alone.
+Tables, figures and claims (report.py) are made from these alone.
 """
 
 from __future__ import annotations
