@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +46,15 @@ SPLITS = ("train", "test")
 
 
 class Bare:
-    """A plain loop of Mitsuba's own calls; no frozen kernels, no code of ours but moving the objects."""
+    """A plain loop of Mitsuba's own calls; no code of ours but moving the objects.
 
-    def __init__(self, render: SampleRenderer) -> None:
+    As a user writes it first, every call traces its kernel anew before it finds it compiled, which at small sizes
+    takes most of the time; `frozen` is for the user who knows of `dr.freeze`.
+    """
+
+    def __init__(self, render: SampleRenderer, frozen: bool) -> None:
+        freeze: Callable = dr.freeze if frozen and dr.is_jit_v(mi.Float) else lambda function: function
+        self._image, self._cast = freeze(_image), freeze(_cast)
         self.spec, self.scene = render.spec, render.scene
         self.path = render.renderer.integrator
         self.aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,normal:sh_normal,albedo:albedo"})
@@ -65,30 +72,40 @@ class Bare:
         self.view.update()
         references = [] if split == "train" else [self.spec.reference_spp] * 2
         for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, *references)):
-            np.array(self._render(self.path, spp, seed * 8 + k))
-        np.array(self._render(self.aov, 1, seed))
+            self._render(self.path, spp, seed * 8 + k)
+        self._render(self.aov, 1, seed)
         self._photons(seed)
 
-    def _render(self, integrator: Any, spp: int, seed: int) -> Any:
-        return mi.render(self.scene.mi_scene, sensor=self.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
+    def _render(self, integrator: Any, spp: int, seed: int) -> np.ndarray:
+        seeds = dr.opaque(mi.UInt32, seed) if dr.is_jit_v(mi.Float) else seed
+        return np.array(self._image(self.scene.mi_scene, self.sensor, integrator, spp, seeds))
 
     def _photons(self, seed: int) -> None:
         count = self.spec.photons if dr.is_jit_v(mi.Float) else 1
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed, count)
         for _ in range(self.spec.photons // count):
-            ray, weight, _ = self.scene.mi_scene.sample_emitter_ray(
-                mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True
-            )
-            hit = self.scene.mi_scene.ray_intersect(ray)
-            for value in (ray.o, ray.d, weight, hit.p, hit.is_valid()):
+            for value in self._cast(self.scene.mi_scene, sampler):
                 np.array(value)
+
+
+def _image(scene: Any, sensor: Any, integrator: Any, spp: int, seed: Any) -> Any:
+    return mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
+
+
+def _cast(scene: Any, sampler: Any) -> tuple:
+    ray, weight, _ = scene.sample_emitter_ray(
+        mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True
+    )
+    hit = scene.ray_intersect(ray)
+    return ray.o, ray.d, weight, hit.p, hit.is_valid()
 
 
 def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[str, Any]:
     """Seconds of every turn of one shard, by (split, who), and kernels compiled after the first round."""
     render = SampleRenderer(spec, 0, max(1, cores() // barrier.parties))
-    bare, compiled = Bare(render), {"bare": 0, "generation": 0}
+    bare = {"bare": Bare(render, frozen=False), "frozen": Bare(render, frozen=True)}
+    compiled = dict.fromkeys((*bare, "generation"), 0)
     seconds: dict[str, list[float]] = {f"{split} {who}": [] for split in SPLITS for who in compiled}
     for turn in range(rounds + 1):
         for split in SPLITS:
@@ -98,14 +115,16 @@ def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[s
                 camera = render.place(split, index)
                 views.append((render.scene.state, camera))
 
-            def plain(shard: Shard = shard, views: list = views) -> None:
+            def plain(loop: Bare, shard: Shard = shard, views: list = views) -> None:
                 for k, (state, camera) in enumerate(views):
-                    bare.sample(state, camera, shard.split, shard.start + k)
+                    loop.sample(state, camera, shard.split, shard.start + k)
 
             def ours(shard: Shard = shard) -> None:
                 render_shard(render, Path(folder) / f"{id(render)}.safetensors", shard, lambda _: None)
 
-            for who, work in (("bare", plain), ("generation", ours)):
+            turns: dict[str, Callable[[], None]] = {who: partial(plain, loop) for who, loop in bare.items()}
+            turns["generation"] = ours
+            for who, work in turns.items():
                 barrier.wait()
                 took, kernels = _timed(work)
                 if turn:  # the first one warms up
@@ -197,7 +216,11 @@ def main() -> None:
     }
     report = {
         "samples_per_second": rates,
-        "ratio": {split: rates[f"{split} generation"] / rates[f"{split} bare"] for split in SPLITS},
+        "ratio": {
+            f"{split} {who}": rates[f"{split} generation"] / rates[f"{split} {who}"]
+            for split in SPLITS
+            for who in ("bare", "frozen")
+        },
         "kernels_compiled_after_the_first_turn": {
             who: sum(result["compiled"][who] for result in results) for who in results[0]["compiled"]
         },
@@ -217,19 +240,25 @@ def main() -> None:
 def markdown(report: dict[str, Any]) -> str:
     options, rates, moved = report["options"], report["samples_per_second"], report["seconds_to_move_all_objects"]
     rate = lambda split, who: f"{rates[f'{split} {who}']:.2f}"
-    rows = [f"| {s} | {rate(s, 'bare')} | {rate(s, 'generation')} | {report['ratio'][s]:.2f} |" for s in SPLITS]
+    ratio = lambda split, who: f"{report['ratio'][f'{split} {who}']:.2f}"
+    names = ("generation", "bare", "frozen")
+    rows = [
+        f"| {' | '.join([s, *(rate(s, who) for who in names), ratio(s, 'bare'), ratio(s, 'frozen')])} |" for s in SPLITS
+    ]
     whole, compiled = report["end_to_end"], report["kernels_compiled_after_the_first_turn"]
     return "\n".join([
         f"Generation of {options['scene']}, {options['experiment']}, {options['resolution']}x{options['resolution']}, "
         f"{options['workers']} processes; {report['manifest']['device']}, {report['manifest']['mitsuba_variant']}.",
         "",
-        "| samples per second | bare loop of mi.render | generation | ratio |",
-        "|---|---:|---:|---:|",
+        "| samples per second | generation | bare loop of mi.render | the same under dr.freeze | ratio to bare "
+        "| ratio to frozen |",
+        "|---|---:|---:|---:|---:|---:|",
         *rows,
         "",
         f"Whole command, starting up included: {whole['samples']} training samples in {whole['seconds']:.1f} s, "
         f"{whole['samples_per_second']:.2f} per second. Kernels compiled after the first turn: generation "
-        f"{compiled['generation']}, bare loop {compiled['bare']}. To move all objects until a ray sees them: instances "
+        f"{compiled['generation']}, bare loop {compiled['bare']}, frozen {compiled['frozen']}. "
+        "To move all objects until a ray sees them: instances "
         f"{1e3 * moved['instances']:.1f} ms, the scene's meshes as loaded {1e3 * moved['meshes']:.1f} ms.",
         "",
         f"`{report['manifest']['command']}`, medians over turns of {options['shard']} samples; what the rays are: see "
