@@ -46,8 +46,7 @@ LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points"
 RUN = f"""if __name__ == "__main__":
     import sys
     from nlt.data import generate as generation
-    from nlt.data.render import SampleRenderer
-from nlt.data.spec import DatasetSpec
+    from nlt.data.spec import DatasetSpec
     generation._announce = lambda *_: None
     generation.generate(DatasetSpec(sys.argv[2:], **{LONG!r}), sys.argv[1], workers=2)
 """
