@@ -19,7 +19,10 @@ from nlt.metrics.inception import find_weights
 from nlt.paths import PROJECT
 from nlt.rendering.variant import choose_variant
 
-_PACKAGES = ("nlt", "torch", "lightning", "torchmetrics", "mitsuba", "drjit", "numpy", "safetensors")
+_PACKAGES = (
+    "nlt", "torch", "lightning", "torchmetrics", "mitsuba", "drjit", "numpy", "safetensors", "flip-evaluator",
+    "mitsuba-oidn",
+)  # fmt: skip
 
 
 def origin() -> dict[str, Any]:
