@@ -30,6 +30,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.test-installed: $(VENV)/.installed
+	sh scripts/system-packages.sh chromium
 	$(PIP) -c constraints.txt -e '.[test]'
 	touch $@
 

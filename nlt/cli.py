@@ -65,6 +65,10 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.report import draw
 
         draw(options.directory)
+    elif options.command == "dashboard":
+        from nlt.evaluation.dashboard import dashboard
+
+        dashboard(options.directory, options.port)
     elif options.command == "scenes":
         _scenes(options)
     elif options.command == "teachers":
@@ -126,8 +130,11 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
-    report = commands.add_parser("report", help="draw the tables and figures of results anew, on any machine")
-    report.add_argument("directory", help="of the results, as `nlt compare` wrote them")
+    report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
+    board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
+    board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")
+    for command in (report, board):
+        command.add_argument("directory", help="of the results, as `nlt compare` wrote them")
     teachers = commands.add_parser("teachers", help="path against bdpt: variance at equal time, scene by scene")
     teachers.add_argument("names", nargs="+", help="descriptions of scenes, by name or path")
     teachers.add_argument("--out", type=Path, default=Path("results/teachers"))

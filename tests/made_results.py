@@ -65,3 +65,25 @@ def make_results(directory, rows, table, seeds=1, over_seeds=0.0, over_views=1e-
             write_images(directory, method, radiance=smooth * (1 + 0.05 * k * rng.standard_normal(smooth.shape)))
         assert (directory / IMAGES / "reference.npz").exists()
     return load(directory)
+
+
+TROUBLED = (
+    "denoising_1_1", "denoising_1_4", "denoising_1_64", "cnn", "nlt", "nlt_photons", "path_tracing_1",
+    "path_tracing_4",
+)  # fmt: skip
+ODD = "odd & <method>"
+
+
+def make_troubled_results(directory):
+    """Two seeds, images, and every trouble: `nlt` diverged at one seed, `ODD` failed at both, nothing has FLIP."""
+    rows = {m: {k: v for k, v in row.items() if k != "flip"} for m, row in papers_numbers("table2").items()}
+    rows = {method: rows[method] for method in TROUBLED}
+    results = make_results(directory, rows, "table2", seeds=2, over_seeds=0.02, over_views=0.1, images=True)
+    bad = [{"method": ODD, "seed": seed, "status": "failed", "message": "it <b>broke</b>"} for seed in (0, 1)]
+    lost = {"method": "nlt", "seed": 1, "status": "diverged", "message": "train/loss is nan"}
+    runs = [lost if (run["method"], run["seed"]) == ("nlt", 1) else run for run in results.runs]
+    write_rows(directory / RUNS, [*({**run, "run": f"runs/{run['method']}-{run['seed']}"} for run in runs), *bad])
+    origin = {"command": "nlt compare --config made_up", "commit": 20 * "ab", "device": "CPU, made up"}
+    configs = {method: {"model": {"init_args": {"width": 8}}} for method in TROUBLED}
+    write_manifest(directory, {**results.manifest, **origin, "versions": {"torch": "2.0"}, "configs": configs})
+    return load(directory)

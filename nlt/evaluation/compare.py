@@ -203,6 +203,7 @@ def obtain(
     if module := untrained(method):
         return module, {}
     checkpoint, took = train(comparison, method, seed, root)
+    took["run"] = str(checkpoint.parents[1])
     return RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval(), took
 
 
@@ -261,7 +262,8 @@ def _fit(run: Path, files: list[str], seed: int) -> dict[str, Any]:
 
 
 def _run_config(run: Path, seed: int) -> dict[str, Any]:
-    logger = {"save_dir": str(run), "name": "", "version": ""}
+    # Hyperparameters are logged when the metrics are known: nlt/evaluation/dashboard.py.
+    logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
     return {
         "seed_everything": seed,
         "model": {"init_args": {"seed": seed}},

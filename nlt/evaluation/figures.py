@@ -152,15 +152,15 @@ def draw_speed_accuracy(results: Results) -> None:
     figure, axes = plt.subplots(2, columns, figsize=(3.3 * columns, 6.4), squeeze=False)
     for axis in axes.flat[len(panels) :]:
         axis.set_axis_off()
-    curves = _curves(results)
-    in_curves = {method for members in curves.values() for method in members}
+    families = curves(results)
+    in_curves = {method for members in families.values() for method in members}
     points = [method for method in results.methods if method not in in_curves]
     for axis, key in zip(axes.flat, panels, strict=False):
         at = {m: (1e3 * results.mean(m, "time_per_frame_s"), results.mean(m, key)) for m in timed}
         at = {m: place for m, place in at.items() if math.isfinite(place[1])}
         front = _pareto_front(at, METRICS[key].direction)
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
-        for k, (name, members) in enumerate(curves.items()):
+        for k, (name, members) in enumerate(families.items()):
             found = [m for m in members if m in at]
             style = {"color": _CURVES[k % len(_CURVES)], "ls": _DASHES[k % 4], "marker": "x+."[k % 3]}
             _plot(axis, results, key, found, at, name, style)
@@ -200,18 +200,19 @@ def _plot(
     if not methods:
         return
     x, y = np.array([at[m] for m in methods]).T
-    bars = np.array([_bar(results, m, key, value) for m, value in zip(methods, y, strict=True)]).T
+    bars = np.array([bar(results, m, key, value) for m, value in zip(methods, y, strict=True)]).T
     axis.errorbar(x, y, yerr=bars, ms=6, lw=1.2, elinewidth=0.9, capsize=2, label=name, **style)
 
 
-def _bar(results: Results, method: str, key: str, mean: float) -> tuple[float, float]:
+def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, float]:
+    """How far an error bar reaches below and above the mean: the deviation over seeds, else the 95% interval."""
     std, (low, high) = results.std(method, key), results.interval(method, key)
     if math.isfinite(std):
         return std, std
     return (max(mean - low, 0), max(high - mean, 0)) if math.isfinite(low) else (0, 0)
 
 
-def _curves(results: Results) -> dict[str, list[str]]:
+def curves(results: Results) -> dict[str, list[str]]:
     """Classes with several methods that path trace: the methods, by what they are called, the cheapest first."""
     families: dict[str, dict[str, tuple[float, float]]] = {}
     for run in results.runs:

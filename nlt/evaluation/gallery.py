@@ -40,7 +40,7 @@ class Shown:
 
     @classmethod
     def load(cls, results: Results) -> Shown | None:
-        """None where the images are on another machine."""
+        """None where the images are on another machine, or no method has any."""
         reference = results.images("reference")
         if reference is None:
             return None
@@ -51,7 +51,8 @@ class Shown:
             for name, arrays in {"reference": reference, **stored}.items()
             if arrays is not None
         }
-        return cls(results, images.pop("reference"), images.pop("noisy"), images)
+        reference_shown, noisy = images.pop("reference"), images.pop("noisy")
+        return cls(results, reference_shown, noisy, images) if images else None
 
     def error(self, method: str) -> np.ndarray:
         """(V, H, W): root of the mean over RGB of the squared difference, of what is displayed."""

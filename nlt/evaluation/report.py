@@ -7,22 +7,25 @@ from pathlib import Path
 from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
 from nlt.evaluation.gallery import Shown, draw_failures, draw_qualitative
+from nlt.evaluation.page import write_page
 from nlt.evaluation.results import load
 from nlt.evaluation.tables import write_tables
 
 
 def draw(directory: str | Path) -> None:
-    """Tables and figures of the results in a directory.
+    """Tables, figures and report.html of the results in a directory.
 
     Raises:
         UserError: there are none.
     """
     results = load(directory)
     write_tables(results)
-    for claim in write_claims(results):
+    claims = write_claims(results)
+    for claim in claims:
         print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
     draw_samples(results)
     draw_speed_accuracy(results)
     if images := Shown.load(results):
         draw_qualitative(images)
         draw_failures(images)
+    write_page(results, claims)

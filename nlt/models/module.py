@@ -146,7 +146,11 @@ class RenderingModule(Method, L.LightningModule):
         self._metrics = [ImageMetrics(perceptual=False).to(self.device)]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        return self._evaluation_step(batch)
+        prediction = self._evaluation_step(batch)
+        # Against the noisy target too, to stand beside train/loss.
+        loss = self.loss(prediction, batch["noisy"], batch["exposure"])
+        self.log("val/loss", loss, batch_size=len(batch["scene"]))
+        return prediction
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val")

@@ -1,0 +1,511 @@
+"""`nlt report`: the same numbers in every table; report.html in headless Chromium, from disk and without a network."""
+
+import csv
+import html.parser
+import json
+import math
+import os
+import re
+import shutil
+import zlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from made_results import ODD, TROUBLED, make_troubled_results
+from matplotlib import colormaps
+from playwright.sync_api import sync_playwright
+
+from nlt.evaluation import page as report_page
+from nlt.evaluation.claims import write_claims
+from nlt.evaluation.packing import COARSEST, max_error, pack, pack_to_fit
+from nlt.evaluation.paper import label, published
+from nlt.evaluation.results import load
+from nlt.evaluation.tables import write_tables
+from nlt.metrics.display import display
+from nlt.metrics.quantities import QUANTITIES
+
+VIEWS, SIZE, EXPOSURE = 4, 32, 0.8  # of make_results
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """The directory of results with their tables, claims and report."""
+    directory = tmp_path_factory.mktemp("stored")
+    results = make_troubled_results(directory)
+    write_tables(results)
+    report_page.write_page(results, write_claims(results))
+    return directory
+
+
+# ---- tables ----
+
+
+class Tables(html.parser.HTMLParser):
+    """The text of every table's rows, by the table's id."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.table, self.cell = {}, None, None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        if tag == "table":
+            self.table = self.tables.setdefault(dict(attributes).get("id"), [])
+        elif tag == "tr":
+            self.table.append([])
+        elif tag in ("td", "th"):
+            self.cell = ""
+
+    def handle_data(self, text):
+        if self.cell is not None:
+            self.cell += text
+
+    def handle_endtag(self, tag):
+        if tag in ("td", "th"):
+            self.table[-1].append(self.cell)
+            self.cell = None
+
+
+def markdown_tables(text):
+    """Rows of cells of every table."""
+    blocks = re.findall(r"(?:^\|.*\|\n)+", text, re.M)
+    split = lambda line: [cell.strip() for cell in line.strip("|").split(" | ")]
+    return [[split(line.strip()) for k, line in enumerate(block.splitlines()) if k != 1] for block in blocks]
+
+
+def latex_tables(text):
+    """The same of LaTeX, its escapes undone."""
+    for command, character in ((r"$\pm$", "±"), (r"$\downarrow$", "↓"), (r"$\uparrow$", "↑"), ("--", "–")):
+        text = text.replace(command, character)
+    found = []
+    for block in re.findall(r"\\toprule\n(.*?)\\bottomrule", text, re.S):
+        lines = [line.removesuffix(r" \\") for line in block.splitlines() if line != r"\midrule"]
+        found.append([[re.sub(r"\\([&%$#_{}])", r"\1", c) for c in re.split(r" (?<!\\)& ", line)] for line in lines])
+    return found
+
+
+def test_all_formats_carry_the_same_numbers(stored):
+    markdown = markdown_tables((stored / "table.md").read_text())
+    page = Tables((stored / "report.html").read_text()).tables
+    assert len(markdown) == 5
+    assert latex_tables((stored / "table.tex").read_text()) == markdown
+    assert [page[f"table-{k}"] for k in range(5)] == markdown
+    with (stored / "table.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    heading = {f"{q.label}{f' ({q.unit})' if q.unit != '1' else ''}": key for key, q in QUANTITIES.items()}
+    compared = 0
+    for table in markdown:
+        keys = [heading[column.rstrip(" ↓↑")] for column in table[0][1:]]
+        for line, row in zip(table[1:], rows, strict=True):
+            assert line[0].startswith(label(row["method"]))
+            for key, cell in zip(keys, line[1:], strict=True):
+                interval = "interval" if " to " in cell else "mean"
+                ours, _, theirs = cell.partition(" / ")
+                columns = [f"{key}_low", f"{key}_high"] if interval == "interval" else [key, f"{key}_std"]
+                for column, text in zip(columns, re.split(" ± | to ", ours), strict=False):
+                    exact = row.get(column, "")
+                    assert (text == "–") == (exact in ("", "nan")), (key, cell)
+                    if text != "–":
+                        rounded = format(float(exact) * QUANTITIES[key].scale, QUANTITIES[key].format)
+                        assert text == rounded
+                        compared += 1
+                assert theirs == ("" if key not in (known := published("table2", row["method"])) or table is not
+                                  markdown[0] else f"{known[key]:g}")  # fmt: skip
+    assert compared > 150
+
+
+def test_without_images(stored, tmp_path):
+    """As from git, which has none: everything else is there."""
+    for path in stored.iterdir():
+        if path.suffix in (".csv", ".json"):
+            shutil.copy(path, tmp_path)
+    report_page.write_page(load(tmp_path), [])
+    page = (tmp_path / "report.html").read_text()
+    assert "No images are stored" in page and Tables(page).tables["table-0"]
+
+
+# ---- packed images ----
+
+
+def unpack(packed, shape, dropped):
+    """Pixel by pixel, with the halves decoded by struct's rule in float64."""
+    data = np.frombuffer(zlib.decompress(packed), np.uint8)
+    count = math.prod(shape)
+    rest = data[:count].astype(int) + 256 * data[count:].astype(int)
+    wrap = lambda v: (v + 0x8000) % 0x10000 - 0x8000
+    code = np.zeros(shape, int)
+    for flat, (k, c, y, x) in enumerate(np.ndindex(*shape)):
+        left = code[k, c, y, x - 1] if x else 0
+        up = code[k, c, y - 1, x] if y else 0
+        corner = code[k, c, y - 1, x - 1] if x and y else 0
+        guess = sorted((left, up, left + up - corner))[1]  # what clamping to the two amounts to
+        zigzag = int(rest[flat])
+        code[k, c, y, x] = wrap(guess + (zigzag // 2 if zigzag % 2 == 0 else -(zigzag + 1) // 2))
+    code[:, 0], code[:, 2] = wrap(code[:, 0] + code[:, 1]), wrap(code[:, 2] + code[:, 1])
+    bits = (np.abs(code) << dropped).astype(np.uint16)
+    return 16 * np.sign(code) * bits.view(np.float16).astype(float)
+
+
+@pytest.mark.parametrize("dropped", [0, 2, COARSEST])
+def test_packed_values_come_back(dropped):
+    """To within the error that the report states, over all magnitudes and both signs; without a neighbour's help."""
+    rng = np.random.default_rng(dropped)
+    images = rng.choice([-1, 1, 1], (2, 3, 9, 11)) * 2 ** rng.uniform(-20, 19, (2, 3, 9, 11))
+    images[0, 0, 0, :3] = [0, 1, 1e9]
+    found = unpack(pack(images, dropped), images.shape, dropped)
+    within = np.abs(found - images) / np.maximum(np.abs(images), 2.0**-10)
+    within[0, 0, 0, 2] = abs(found[0, 0, 0, 2] / 2**20 - 1)
+    assert within.max() <= max_error(dropped) * 1.001
+    assert within.max() > 0.5 * max_error(dropped)
+
+
+def test_packing_fits():
+    """Coarser before fewer, never larger."""
+    rng = np.random.default_rng(0)
+    views = [rng.lognormal(0, 1, (3, 3, 24, 24)) for _ in range(8)]
+    whole = sum(len(pack(view, 0)) for view in views)
+    assert pack_to_fit(views, whole)[1] == 0
+    packed, dropped = pack_to_fit(views, int(0.8 * whole))
+    assert len(packed) == 8 and dropped > 0 and sum(map(len, packed)) <= 0.8 * whole
+    packed, dropped = pack_to_fit(views, whole // 4)
+    assert 1 < len(packed) < 8 and sum(map(len, packed)) <= whole // 4
+
+
+# ---- the page ----
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.fail("no chromium: run scripts/system-packages.sh chromium, or apt-get install chromium")
+    with sync_playwright() as playwright:
+        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+        browser = playwright.chromium.launch(executable_path=path, args=arguments)
+        yield browser
+        browser.close()
+
+
+class Report(SimpleNamespace):
+    """A page of the report and what it did; the methods wait until the viewer has drawn."""
+
+    def state(self):
+        self.page.wait_for_function("$('canvas').dataset.drawn === JSON.stringify(state)")
+        return self.page.evaluate("({...state})")
+
+    def shown(self, left=0.0, right=1.0):
+        """The image's pixels, each read at its middle in the viewer, (SIZE, SIZE, 3); of a part of the width."""
+        self.state()
+        return self.read("canvas => canvas", SIZE)[:, int(left * SIZE) : int(right * SIZE)]
+
+    def read(self, canvas, size):
+        """(size, size, 3) of what a canvas shows, by a function from the viewer's canvas to it."""
+        code = f"""size => {{
+            const canvas = ({canvas})($("canvas")), copy = new OffscreenCanvas(canvas.width, canvas.height);
+            const context = copy.getContext("2d", {{ willReadFrequently: true }});
+            context.drawImage(canvas, 0, 0);
+            const at = (k, length) => Math.floor((k + 0.5) * length / size), out = [];
+            for (let y = 0; y < size; y++) for (let x = 0; x < size; x++)
+                out.push(...context.getImageData(at(x, canvas.width), at(y, canvas.height), 1, 1).data.slice(0, 3));
+            return out; }}"""
+        return np.array(self.page.evaluate(code, size)).reshape(size, size, 3)
+
+    def press(self, *keys):
+        for key in keys:
+            self.page.keyboard.press(key)
+        return self.state()
+
+    def focus(self):
+        self.page.focus("#stage")
+        return self
+
+
+@pytest.fixture
+def open_report(browser, stored):
+    """Opens the report as a file; at the end nothing may have failed or asked for anything else."""
+    opened = []
+
+    def open_(fragment="", width=1280, directory=stored, **options):
+        context = browser.new_context(viewport={"width": width, "height": 900}, offline=True, **options)
+        page = context.new_page()
+        report = Report(page=page, trouble=[], requests=[], context=context)
+        page.on("console", lambda message: report.trouble.append(message.text))
+        page.on("pageerror", lambda error: report.trouble.append(str(error)))
+        page.on("request", lambda request: report.requests.append(request.url))
+        page.goto((directory / "report.html").as_uri() + fragment)
+        opened.append(report)
+        return report
+
+    yield open_
+    for report in opened:
+        assert report.trouble == []
+        assert [url for url in report.requests if not url.startswith(("data:", "blob:"))] == [report.requests[0]]
+        assert report.requests[0].startswith("file:///")
+        report.context.close()
+
+
+def radiance(stored, name, view=0):
+    with np.load(stored / f"images/{name}.npz") as file:
+        return file["radiance"][view].astype(np.float32)
+
+
+def displayed(image, ev=0.0):
+    """(H, W, 3) in [0, 255]."""
+    return 255 * display(torch.from_numpy(image)[None], EXPOSURE * 2.0**ev)[0].permute(1, 2, 0).numpy()
+
+
+def test_nothing_scrolls_sideways(open_report):
+    for width in (1280, 400):
+        report = open_report(width=width)
+        report.state()
+        assert report.page.evaluate("document.documentElement.scrollWidth") <= width
+        box = report.page.locator("#stage").bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] <= width
+
+
+def test_sorting(open_report, stored):
+    page = open_report().page
+    heading = page.locator("#table-0 thead th", has_text="MSE")
+    column = lambda: page.locator("#table-0 tbody tr").evaluate_all("rows => rows.map(r => r.cells[2].textContent)")
+    names = lambda: page.locator("#table-0 tbody th").all_text_contents()
+    first, order = column(), names()
+    heading.locator("button").click()
+    number = lambda cell: float(cell.split()[0]) if cell[0].isdigit() else math.inf
+    assert column() == sorted(first, key=number) and heading.get_attribute("aria-sort") == "ascending"
+    assert column()[-1] == "–"
+    heading.locator("button").click()
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert column() == sorted(first, key=lambda c: -number(c) if c != "–" else math.inf)
+    page.locator("#table-0 thead th").first.locator("button").click()
+    assert names() == order
+    page.locator("#table-0 thead th", has_text="MSSIM").locator("button").press("Enter")
+    best = page.locator("#table-0 tbody tr").first.locator("td").nth(2)
+    assert best.get_attribute("class") == "best"
+
+
+def test_trouble_is_shown(open_report):
+    """Diverged at a seed, failed at all, a metric that nothing has."""
+    page = open_report().page
+    assert f"Ours (w/o photons): 1 of 2 diverged; {ODD}: 2 of 2 failed" in page.locator("header").inner_text()
+    row = page.locator("#table-0 tbody tr", has_text=f"{ODD} [2 of 2 failed]")
+    assert set(row.locator("td").all_text_contents()) == {"–"}
+    assert "it <b>broke</b>" in page.locator("#runs").inner_text()
+    assert f"Not shown: {ODD} (2 of 2 failed)." in page.locator("#chart-note").inner_text()
+    assert "FLIP ↓" not in page.locator("#chart-y option").all_text_contents()
+    assert page.locator("#a option").count() == len(TROUBLED) + 4
+
+
+def test_claims(open_report, stored):
+    """Each with its verdict; opened, every comparison with its margin."""
+    page = open_report().page
+    claims = json.loads((stored / "claims.json").read_text())
+    assert page.locator("#claims details").count() == len(claims) > 5
+    for claim in claims:
+        details = page.locator(f"#{claim['id']}")
+        assert claim["verdict"] in details.locator("summary").inner_text() and claim["says"] in details.inner_text()
+        details.locator("summary").click()
+        rows = details.locator("tbody tr").all_inner_texts()
+        assert len(rows) == len(claim["comparisons"])
+        for row, comparison in zip(rows, claim["comparisons"], strict=True):
+            margin = comparison["margin"]
+            assert comparison["verdict"] in row and ("–" if margin is None else f"{margin:+.3g}") in row
+
+
+def test_provenance(open_report, stored):
+    page = open_report().page
+    manifest = json.loads((stored / "manifest.json").read_text())
+    text = page.locator("#provenance").inner_text()
+    for value in (manifest["command"], manifest["commit"], manifest["device"], "torch 2.0", "0, 1"):
+        assert value in text
+    with (stored / "runs.csv").open(newline="") as file:
+        exact = next(row["mse"] for row in csv.DictReader(file) if row["method"] == "cnn")
+    title = page.locator("#table-0 tbody tr", has_text="CNN only").locator("td").nth(1).get_attribute("title")
+    assert f"seed 0: {exact}" in title and "runs.csv" in title
+    with page.expect_download() as download:
+        page.click("a[download='table.tex']")
+    assert download.value.path().read_bytes() == (stored / "table.tex").read_bytes()
+
+
+@pytest.mark.parametrize("ev", [0, 2.5, -3])
+def test_exposure_is_the_display_transform(open_report, stored, ev):
+    report = open_report(f"#view=2&a=cnn&mode=flip&front=a&ev={ev}")
+    expected = displayed(radiance(stored, "cnn", 2), ev)
+    assert np.abs(report.shown() - expected).max() < 0.75  # half a level, and what packing loses
+    report.page.locator("#ev").fill(str(ev + 1))
+    assert np.abs(report.shown() - displayed(radiance(stored, "cnn", 2), ev + 1)).max() < 0.75
+
+
+def test_flip_and_slider(open_report, stored):
+    report = open_report().focus()
+    state = report.state()
+    assert (state["mode"], state["a"], state["b"]) == ("slider", "nlt_photons", "reference")
+    a, b = (displayed(radiance(stored, name)) for name in ("nlt_photons", "reference"))
+    assert np.abs(a - b).max() > 5
+    half = SIZE // 2
+    assert np.abs(report.shown(0, 0.5) - a[:, :half]).max() < 1 and np.abs(report.shown(0.5) - b[:, half:]).max() < 1
+    box = report.page.locator("#stage").bounding_box()
+    report.page.locator("#divider").hover(position={"x": 12, "y": 30})
+    report.page.mouse.down()
+    report.page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 40, steps=3)
+    report.page.mouse.up()
+    assert report.state()["split"] == pytest.approx(0.75, abs=0.01)
+    assert np.abs(report.shown(0, 0.75) - a[:, : 3 * SIZE // 4]).max() < 1
+    assert np.abs(report.shown(0.75) - b[:, 3 * SIZE // 4 :]).max() < 1
+    report.press("f")
+    assert np.abs(report.shown() - b).max() < 1 and report.page.locator("#corner-a").is_hidden()
+    report.press("f")
+    assert np.abs(report.shown() - a).max() < 1
+    report.page.locator("#strip button[data-id=path_tracing_1]").click(modifiers=["Shift"])
+    report.page.click("#swap")
+    assert np.abs(report.shown() - displayed(radiance(stored, "path_tracing_1"))).max() < 1
+    report.page.select_option("#a", "normal")
+    with np.load(stored / "images/gbuffer.npz") as file:
+        normal = 255 * (file["normal"][0].transpose(1, 2, 0).astype(float) / 2 + 0.5)
+    assert np.abs(report.shown() - normal).max() < 1
+
+
+def test_zoom(open_report, stored):
+    """Pixelated, about the pointer, in step with the small images; panned by drag and by keys."""
+    report = open_report("#view=1&a=cnn&mode=flip").focus()
+    image = displayed(radiance(stored, "cnn", 1))
+    report.press("+", "+")
+    quarter = slice(3 * SIZE // 8, 5 * SIZE // 8)
+    expected = image[quarter, quarter].repeat(4, 0).repeat(4, 1)
+    assert np.abs(report.shown() - expected).max() < 1
+    small = report.read("() => document.querySelector('#strip button[data-id=cnn] canvas')", SIZE // 4)
+    assert np.abs(small - image[quarter, quarter]).max() < 1
+    report.press("Shift+ArrowRight", "Shift+ArrowRight")
+    assert report.state()["x"] == pytest.approx(0.55)
+    report.press("r")
+    box = report.page.locator("#stage").bounding_box()
+    report.page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 2)
+    report.page.mouse.wheel(0, -100)
+    report.page.mouse.wheel(0, -100)
+    state = report.state()
+    assert state["zoom"] == pytest.approx(2)
+    assert (state["x"], state["y"]) == (pytest.approx(0.75, abs=0.01), pytest.approx(0.25, abs=0.01))
+    report.page.mouse.down()
+    report.page.mouse.move(box["x"] + box["width"] / 2 + 3, box["y"] + box["height"] / 2 + 3, steps=3)
+    report.page.mouse.up()
+    assert report.state()["x"] == pytest.approx(0.75)  # at the border already
+    assert report.page.locator("#readout").inner_text().startswith("pixel 24, 8")
+
+
+def test_error_map(open_report, stored):
+    report = open_report("#view=0&a=cnn&mode=flip&ev=2&error=1")
+    error = np.abs(displayed(radiance(stored, "cnn")) - displayed(radiance(stored, "reference"))).mean(-1) / 255
+    scale = report.page.evaluate("data.error_scale")
+    assert np.percentile(error, 90) < scale < 1
+    found, levels = report.shown(), 255 * np.clip(error / scale, 0, 1)
+    colours = 255 * colormaps["inferno"](np.arange(256))[:, :3]
+    nearest = np.abs(found[..., None, :] - colours).sum(-1).argmin(-1)
+    assert np.abs(nearest - levels).max() < 3
+    assert report.page.locator("#colour-bar").is_visible()
+
+
+def test_link(open_report):
+    report = open_report().focus()
+    state = report.press("ArrowRight", "ArrowRight", "ArrowDown", "b", "b", "e", "e", "e", "+", "Shift+ArrowLeft", "d")
+    assert (state["view"], state["ev"], state["zoom"], state["error"]) == (2, 1.5, 2, True)
+    report.page.wait_for_function("location.hash.length > 1")
+    report.page.wait_for_function("location.hash === link()")
+    link = report.page.locator("#link").get_attribute("href")
+    assert open_report(link).state() == state
+    report.page.evaluate("location.hash = '#view=1&a=nonsense&zoom=-3&ev=x&mode=?'")
+    report.page.wait_for_function("state.view === 1")
+    assert report.state() == {**report.page.evaluate("({...initial})"), "view": 1}
+
+
+def test_keyboard_alone(open_report):
+    """Tab reaches the viewer, whose keys then do everything; what has the focus says what it is."""
+    report = open_report()
+    page = report.page
+    active = "document.activeElement"
+    page.keyboard.press("Tab")
+    assert page.evaluate(f"{active}.textContent") == "Skip to the images"
+    page.keyboard.press("Enter")
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        named = page.evaluate(
+            f"e => {active}.getAttribute('aria-label') || {active}.textContent || {active}.labels?.length"
+        )
+        assert named
+        if page.evaluate(f"{active}.id") == "stage":
+            break
+    assert page.evaluate(f"{active}.id") == "stage"
+    assert report.press("1")["a"] == "reference" and report.press("Shift+3")["b"] == "denoising_1_1"
+    assert report.press("x")["a"] == "denoising_1_1" and report.press("ArrowLeft")["view"] == VIEWS - 1
+    assert report.press(" ")["mode"] == "flip" and report.press("s")["mode"] == "slider"
+    page.keyboard.press("Tab")
+    divider = page.locator("#divider")
+    assert page.evaluate(f"{active}.id") == "divider" and divider.get_attribute("role") == "slider"
+    assert report.press("ArrowRight")["split"] == pytest.approx(0.52) and report.press("End")["split"] == 1
+    assert divider.get_attribute("aria-valuenow") == "100"
+    page.keyboard.press("?")
+    assert page.locator("#keys").is_visible()
+    page.keyboard.press("Escape")
+    assert page.locator("#keys").is_hidden() and page.evaluate(f"{active}.id") == "divider"
+    state = report.press("w")
+    worst = page.evaluate("data.views.map(v => v.metrics.denoising_1_1.mse[0])")
+    assert state["view"] == int(np.argmax(worst))
+
+
+def test_chart(open_report, stored):
+    """Points where the numbers are; the front; a click shows the images; another metric, another order."""
+    report = open_report()
+    page = report.page
+    with (stored / "table.csv").open(newline="") as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+
+    def places():
+        code = """points => points.map(point => {
+            const { cx, cy } = point.querySelector(".ring").attributes;
+            return [point.dataset.method, Number(cx.value), Number(cy.value)]; })"""
+        return {name: (x, y) for name, x, y in page.locator("#chart .point").evaluate_all(code)}
+
+    for key, log in (("mssim", False), ("mse", True), ("fid", True)):
+        page.select_option("#chart-y", key)
+        at = places()
+        assert set(at) == set(TROUBLED)
+        value = lambda m, key=key: float(rows[m][key])
+        x = np.log([float(rows[m]["time_per_frame_s"]) for m in at])
+        assert np.corrcoef(x, [p[0] for p in at.values()])[0, 1] == pytest.approx(1, abs=1e-6)
+        y = [value(m) for m in at]
+        up = [-p[1] for p in at.values()]
+        straight = [np.corrcoef(f(y), up)[0, 1] for f in (np.asarray, np.log)]
+        assert max(straight) == pytest.approx(1, abs=1e-6), (key, log)
+        sign = 1 if QUANTITIES[key].direction == "lower" else -1
+        seconds = lambda m: float(rows[m]["time_per_frame_s"])
+        front = [m for m in at if not any(seconds(o) < seconds(m) and sign * value(o) <= sign * value(m) for o in at)]
+        listed = page.locator("#budget button").evaluate_all("buttons => buttons.map(b => b.dataset.method)")
+        assert listed == sorted(front, key=seconds)
+    page.locator("#chart .point[data-method=cnn]").click()
+    assert report.state()["a"] == "cnn" and page.evaluate("document.activeElement.id") == "stage"
+    page.mouse.move(0, 0)
+    page.locator("#chart .point[data-method=nlt]").focus()
+    assert "Ours (w/o photons)" in page.locator("#tip").inner_text()
+    page.keyboard.press("Enter")
+    assert report.state()["a"] == "nlt"
+
+
+def test_too_large_for_one_file(open_report, stored, tmp_path, monkeypatch):
+    """Coarser and fewer images, and the page says so; what it unpacks is as near as it says."""
+    directory = shutil.copytree(stored, tmp_path / "copy")
+    report_page.write_page(load(directory), [])
+    whole = (directory / "report.html").read_text()
+    limit = len(whole) - int(0.6 * sum(map(len, re.findall(r'id="images-\d+">([^<]+)', whole))))
+    monkeypatch.setattr(report_page, "_OTHER", 60_000)
+    monkeypatch.setattr(report_page, "_SIZE", limit)
+    report_page.write_page(load(directory), [])
+    assert 0.5 * limit < (directory / "report.html").stat().st_size <= limit
+    report = open_report(directory=directory)
+    views, dropped = report.page.evaluate("[data.views.length, data.dropped]")
+    assert views < VIEWS and dropped > 0
+    note = report.page.locator("#viewer .note").first.inner_text()
+    assert f"{views} of {VIEWS} stored views" in note and f"{100 * max_error(dropped):.2g} %" in note
+    found = report.page.evaluate("imagesOf(0).then(all => Array.from(all[imageIndex.get('cnn')]))")
+    expected = (radiance(stored, "cnn") * EXPOSURE).ravel()
+    within = np.abs(np.array(found) - expected) / np.maximum(np.abs(expected), 2.0**-10)
+    assert within.max() <= 1.001 * max_error(dropped)
