@@ -17,6 +17,7 @@ import torch
 from made_results import make_results, papers_numbers
 from PIL import Image
 from skimage.metrics import structural_similarity
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import DATASET, SCALE, use_tiny_inception, write
 from torch.utils.data import default_collate
 
@@ -26,6 +27,7 @@ from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock, compare
+from nlt.evaluation.dashboard import write_logs
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.gallery import Shown, worst_pixels
 from nlt.evaluation.report import draw
@@ -394,6 +396,17 @@ def test_sizes(world):
     inputs = 4 * (pixels * channels + 1) + 2 * 8
     assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + 5)
     assert set(clock.Clock(frames, torch.device("cpu")).size(compare.untrained("oidn_1"))) == {"parameters"}
+
+
+def test_dashboard(world):
+    """Each training's own curves and grids, as links, beside its final metrics; Lightning's hyperparameters are off."""
+    logs = write_logs(load("out"))
+    assert {path.parent.relative_to(logs).as_posix() for path in logs.glob("**/seed_3")} == set(world.rows)
+    (training,) = (path for path in (logs / "cnn/seed_3").iterdir() if path.is_symlink())
+    tags = EventAccumulator(str(training)).Reload().Tags()
+    assert {"train/loss", "val/loss", "val/mse"} <= set(tags["scalars"]) and tags["images"] == ["val/images"]
+    assert "hp_metric" not in tags["scalars"] and not tags["histograms"]
+    assert not any(path.is_symlink() for path in (logs / "oidn_1/seed_3").iterdir())
 
 
 # ---- drawn from results ---------------------------------------------------------------------------------

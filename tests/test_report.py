@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_results import ODD, TROUBLED, make_troubled_results
+from made_results import ODD, TROUBLED, make_results, make_troubled_results, papers_numbers
 from matplotlib import colormaps
 from playwright.sync_api import sync_playwright
 
@@ -178,7 +178,7 @@ def test_packing_fits():
 
 @pytest.fixture(scope="module")
 def browser():
-    path = shutil.which("chromium") or shutil.which("google-chrome")
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if path is None:
         pytest.fail("no chromium: run scripts/system-packages.sh chromium, or apt-get install chromium")
     with sync_playwright() as playwright:
@@ -488,6 +488,21 @@ def test_chart(open_report, stored):
     assert "Ours (w/o photons)" in page.locator("#tip").inner_text()
     page.keyboard.press("Enter")
     assert report.state()["a"] == "nlt"
+
+
+def test_without_times(open_report, tmp_path):
+    """As of the ablation, whose methods lie in a folder: no chart over time, and everything else."""
+    rows = {
+        method: {key: value for key, value in row.items() if key != "time_per_frame_s"}
+        for method, row in papers_numbers("ablation").items()
+    }
+    report_page.write_page(make_results(tmp_path, rows, "ablation", images=True), [])
+    report = open_report(directory=tmp_path)
+    assert "time" not in report.page.locator("#chart-x").inner_text()
+    (first, *_) = rows
+    report.page.select_option("#a", first)
+    assert np.abs(report.shown(0, 0.5) - displayed(radiance(tmp_path, first))[:, : SIZE // 2]).max() < 1
+    assert report.page.locator("#claims").count() == 0 and report.page.locator("nav a[href='#claims']").is_hidden()
 
 
 def test_too_large_for_one_file(open_report, stored, tmp_path, monkeypatch):
