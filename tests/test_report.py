@@ -395,7 +395,8 @@ def test_zoom(open_report, stored):
 
 def test_error_map(open_report, stored):
     report = open_report("#view=0&a=cnn&mode=flip&ev=2&error=1")
-    error = np.abs(displayed(radiance(stored, "cnn")) - displayed(radiance(stored, "reference"))).mean(-1) / 255
+    difference = displayed(radiance(stored, "cnn")) - displayed(radiance(stored, "reference"))
+    error = np.sqrt(np.square(difference / 255).mean(-1))
     scale = report.page.evaluate("data.error_scale")
     assert np.percentile(error, 90) < scale < 1
     found, levels = report.shown(), 255 * np.clip(error / scale, 0, 1)

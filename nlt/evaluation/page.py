@@ -19,7 +19,8 @@ from PIL import Image
 from nlt.data.files import write_bytes
 from nlt.evaluation.claims import Claim, Comparison
 from nlt.evaluation.claims import text as claim_text
-from nlt.evaluation.figures import bar, curves, shown
+from nlt.evaluation.figures import bar, curves
+from nlt.evaluation.gallery import Shown
 from nlt.evaluation.packing import max_error, pack_to_fit
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, Results
@@ -128,13 +129,14 @@ def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
     views = [np.stack([array[v] for _, _, array in images.values()]) for v in range(len(reference["view"]))]
     packed, dropped = pack_to_fit(views, size * 3 // 4)  # base64
     height, width = views[0].shape[-2:]
+    compared = Shown.load(results)
     return packed, {
         "images": [{"id": name, "label": title, "kind": kind} for name, (title, kind, _) in images.items()],
         "height": height,
         "width": width,
         "dropped": dropped,
         "stored": len(views),
-        "error_scale": _error_scale(images),
+        "error_scale": float(f"{compared.scale:.3g}") if compared else 1.0,
         "colours": base64.b64encode(
             matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].tobytes()
         ).decode(),
@@ -147,22 +149,6 @@ def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
             for k, view in enumerate(reference["view"][: len(packed)])
         ],
     }
-
-
-def _error_scale(images: dict[str, tuple[str, str, np.ndarray]]) -> float:
-    """One for all error maps: the 99th percentile of all methods' errors, rounded up to a digit."""
-    target = images["reference"][2]
-    errors = [
-        np.abs(shown(array[v], 1) - shown(target[v], 1)).mean(-1)
-        for name, (_, kind, array) in images.items()
-        if kind == "radiance" and name not in ("reference", "noisy")
-        for v in range(len(target))
-    ]
-    most = float(np.percentile(errors, 99)) if errors else 0.0
-    if most <= 0:
-        return 1.0
-    digit = 10.0 ** math.floor(math.log10(most))
-    return round(math.ceil(most / digit) * digit, 9)
 
 
 def _of_view(results: Results, view: int, names: list[str]) -> dict[str, dict[str, list[Any]]]:

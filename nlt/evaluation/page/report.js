@@ -293,8 +293,8 @@ function picture(images, index, ev, error) {
     out[4 * i + 3] = 255;
     if (error && kind === "radiance") {
       let sum = 0;
-      for (let c = 0; c < 3; c++) sum += Math.abs(display(values[i + c * size]) - display(images[0][i + c * size])) / 3;
-      const entry = 3 * Math.round(255 * Math.min(sum / data.error_scale, 1));
+      for (let c = 0; c < 3; c++) sum += (display(values[i + c * size]) - display(images[0][i + c * size])) ** 2 / 3;
+      const entry = 3 * Math.round(255 * Math.min(Math.sqrt(sum) / data.error_scale, 1));
       for (let c = 0; c < 3; c++) out[4 * i + c] = colours[entry + c];
     } else for (let c = 0; c < 3; c++) out[4 * i + c] = 255 * shown(gain * values[i + c * size]);
   }
