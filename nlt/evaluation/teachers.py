@@ -28,7 +28,8 @@ from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.scenes.assembly import Scene
 from nlt.scenes.description import TEACHERS, load_description
-from nlt.scenes.state import sample_state, sample_view
+from nlt.scenes.state import sample_state
+from nlt.scenes.views import Views
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -86,11 +87,13 @@ def _measure(name: str, seconds: float, resolution: int, views: int, experiment:
     use_variant()
     description = load_description(name)
     scene = Scene(description, experiment)
+    look = Views(scene)
     renderers = {teacher: Renderer(scene, teacher) for teacher in TEACHERS}
     placed = []
     for view in range(views):
         rng = np.random.default_rng([seed, view])
-        placed.append((sample_state(description, experiment, rng), sample_view(description, resolution, rng)))
+        scene.set_state(sample_state(description, experiment, rng))
+        placed.append((scene.state, look.sample(resolution, rng)))
     images: dict[str, list[list[np.ndarray]]] = {teacher: [[] for _ in placed] for teacher in TEACHERS}
     times: dict[str, list[float]] = {teacher: [] for teacher in TEACHERS}
     start, renders = time.perf_counter(), -1  # the first of all is the warm-up
