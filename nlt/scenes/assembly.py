@@ -99,7 +99,10 @@ class Scene:
             else:
                 groups.setdefault(owner.get(name, STATIC), {})[name] = mesh
         for key, members in groups.items():
-            group = mi.load_dict({"type": "shapegroup", **members})
+            # Meshes of one BSDF become one: kernels are traced, and what is frozen is looked through, shape by shape.
+            merged = mi.load_dict({"type": "merge", **members})
+            merged = merged if isinstance(merged, list) else [merged]
+            group = mi.load_dict({"type": "shapegroup", **{str(k): mesh for k, mesh in enumerate(merged)}})
             parts[f"group_{key}"] = group
             parts[f"instance_{key}"] = {"type": "instance", "to_world": mi.ScalarTransform4f(), "of": group}
         if self.environment is not None:

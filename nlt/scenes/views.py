@@ -71,12 +71,12 @@ class Views:
         side = int(np.sqrt(_RAYS))
         rows, columns = (np.mgrid[:side, :side] + 0.5) / side
         image = camera.directions(np.stack([columns.ravel() * camera.width, rows.ravel() * camera.height], 1))
-        distance, behind, shape = self._look(camera.position, np.concatenate([self._sphere, image]))
+        distance, behind, shape = self.look(camera.position, np.concatenate([self._sphere, image]))
         back = behind ^ np.isin(shape, self._inverted)
         share = lambda mask: max(half.mean() for half in np.split(mask, 2))
         return Shares(share(back), (distance[_RAYS:] < _NEAR).mean(), share(np.isinf(distance)))
 
-    def _look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    def look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Of each ray: the distance (m), whether it meets the back of a shape, and a number for the shape."""
         units = self.scene.description.units_per_metre
         origins = np.tile(position * units, (len(directions), 1))
@@ -89,7 +89,7 @@ class Views:
         rng = np.random.default_rng(0)
         description = self.scene.description
         with self.scene.in_state(rest_state(description, self.scene.experiment)):
-            looks = [self._look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
+            looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
         distance, behind, shape = (np.concatenate(column) for column in zip(*looks, strict=True))
         hit = np.isfinite(distance)
         numbers, which = np.unique(shape[hit], return_inverse=True)
