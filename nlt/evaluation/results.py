@@ -6,7 +6,7 @@ results/NAME/ holds
   or null), `n_test`, `seeds`, `scenes`, `shown` (the indices of the test views whose images are kept);
 - `runs.csv`: a row per method and seed with every number as it was measured, by the keys of `QUANTITIES`; `status`
   is ok, diverged or failed, and `message` says why; `family` is the method's class, `spp` and `pixel_fraction` what
-  of a frame it path traces;
+  of a frame it path traces, `run` the directory of its training;
 - `views.csv`: a row per method, seed and test view with the metrics of that image. `fid_without` and `kid_without`
   are those of the test set without the view's jackknife group: they carry these metrics' uncertainty;
 - `images/METHOD.npz`, not in git: `radiance` (V, 3, H, W), float16, linear, of the first seed, for the shown views.
