@@ -207,10 +207,8 @@ def test_image_grid_where_validation_is_rare(tmp_path):
 
 
 def test_image_grid_without_a_logger(tmp_path):
-    batch = synthetic_batch()
-    del batch["noisy"]
     run = trainer(tmp_path, callbacks=[ImageGrid()], num_sanity_val_steps=0)
-    run.validate(CNN(width=4), loader(batch), verbose=False)
+    run.validate(CNN(width=4), loader(synthetic_batch()), verbose=False)
 
 
 @pytest.fixture(scope="module")

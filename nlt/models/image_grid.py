@@ -47,9 +47,7 @@ class ImageGrid(L.Callback):
         if not self._active(trainer) or len(self._rows) >= self.images:
             return
         reference = (batch["reference_a"] + batch["reference_b"]) / 2
-        columns = [outputs, reference, (outputs - reference).abs()]
-        if "noisy" in batch:
-            columns.insert(0, batch["noisy"])
+        columns = [batch["noisy"], outputs, reference, (outputs - reference).abs()]
         rows = torch.cat([display(x, batch["exposure"]) for x in columns], dim=-1)
         self._rows += rows[: self.images - len(self._rows)].cpu()
 
