@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from functools import partial
 
 import pytest
 from made_results import ODD, make_troubled_results
@@ -37,7 +38,10 @@ def test_tensorboard_shows_it(stored):
     """A run per method and seed with its training's curves; the layout; hyperparameters; the chart; no histograms."""
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
     command = [sys.executable, "-c", "from nlt.cli import main; main()", "dashboard", str(stored), "--port=0"]
-    server = subprocess.Popen(command, cwd=stored.parent, stdout=subprocess.PIPE, text=True, env=environment)
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which the background jobs of a shell ignore
+    server = subprocess.Popen(
+        command, cwd=stored.parent, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=heed
+    )
     try:
         url = re.match(r"(http://\S+?)/? shows", server.stdout.readline())[1]
 
