@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -17,7 +17,7 @@ import yaml
 from nlt.data.files import AnyPath, open_path
 from nlt.data.sample import FIELDS, SPLITS, Field
 from nlt.errors import UserError
-from nlt.scenes.description import EXPERIMENTS, Experiment, SceneDescription, load_description
+from nlt.scenes.description import EXPERIMENTS, TEACHERS, Experiment, SceneDescription, Teacher, load_description
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 2  # of the files on disk
@@ -25,7 +25,6 @@ FORMAT = 2  # of the files on disk
 SECTIONS = ("data", "model", "trainer", "seed_everything")
 DATA = ("dataset", "root", "batch_size", "workers", "seed", "online")
 _DRAWS = 1000  # of a state that no other split has
-Teacher = Literal["scene", "path", "bdpt"]
 
 
 @dataclass
@@ -62,7 +61,7 @@ class DatasetSpec:
     reference_spp: int = 64
     seed: int = 0
     shard_size: int = 64
-    teacher: Teacher = "scene"
+    teacher: Literal["scene", Teacher] = "scene"
 
     def __post_init__(self) -> None:
         at = "data.dataset"
@@ -70,8 +69,8 @@ class DatasetSpec:
             raise UserError(f"{at}.scenes: must be a list of scene names, is {self.scenes!r}")
         if self.experiment not in EXPERIMENTS:
             raise UserError(f"{at}.experiment: must be one of {', '.join(EXPERIMENTS)}, is {self.experiment!r}")
-        if self.teacher not in get_args(Teacher):
-            raise UserError(f"{at}.teacher: must be one of {', '.join(get_args(Teacher))}, is {self.teacher!r}")
+        if self.teacher not in ("scene", *TEACHERS):
+            raise UserError(f"{at}.teacher: must be one of scene, {', '.join(TEACHERS)}, is {self.teacher!r}")
         least = {"resolution": 8, "seed": 0, **dict.fromkeys(SPLITS, 0)}
         for field in dataclasses.fields(self)[2:-1]:
             value, low = getattr(self, field.name), least.get(field.name, 1)

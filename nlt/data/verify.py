@@ -20,6 +20,7 @@ from nlt.data.sample import POINT_FIELDS, SPLITS, Field
 from nlt.data.spec import DatasetSpec, Shard
 from nlt.data.store import CRC, MANIFEST, dataset_files, points_name, read_manifest, read_spec
 from nlt.errors import UserError
+from nlt.scenes.state import SceneState
 
 _RADIANCE = ("noisy", "noisy_input", "reference_a", "reference_b")
 
@@ -92,7 +93,7 @@ def _check_shard(directory: AnyPath, spec: DatasetSpec, task: Shard | int) -> _F
     if _check_form(file, fields, count, spec.sizes) and not points:
         _check_images(file)
         rows = zip(file.arrays["translation"], file.arrays["present"], strict=True)
-        file.states = {moved.tobytes() + present.tobytes() for moved, present in rows}
+        file.states = {SceneState(moved, present).key for moved, present in rows}
     return file
 
 
