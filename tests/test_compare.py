@@ -26,7 +26,7 @@ from nlt.baselines.cnn import CNN
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import clock, compare
+from nlt.evaluation import clock, compare, comparison
 from nlt.evaluation.dashboard import write_logs
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.gallery import Shown, worst_pixels
@@ -106,7 +106,7 @@ def world(tiny, tmp_path_factory, one_thread):
         patch.chdir(folder)
         patch.syspath_prepend(folder)
         patch.setattr(paths, "CONFIGS", folder / "configs")
-        patch.setattr(compare, "CONFIGS", folder / "configs")
+        patch.setattr(comparison, "CONFIGS", folder / "configs")
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
         patch.setattr(clock.Clock, "_frame", spy)
@@ -395,7 +395,7 @@ def test_sizes(world):
     # The features' concatenation and the convolution's output; inputs and parameters besides.
     inputs = 4 * (pixels * channels + 1) + 2 * 8
     assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + 5)
-    assert set(clock.Clock(frames, torch.device("cpu")).size(compare.untrained("oidn_1"))) == {"parameters"}
+    assert set(clock.Clock(frames, torch.device("cpu")).size(comparison.untrained("oidn_1"))) == {"parameters"}
 
 
 def test_dashboard(world):
@@ -531,10 +531,10 @@ def test_causes_of_failures(tmp_path):
 @pytest.mark.parametrize("name", paths.config_names("compare"))
 def test_every_comparison_names_what_there_is(name):
     """Its data, scale and methods; without a list, every method that is not in a folder."""
-    found = compare.Comparison.load(name, None, None, None, seeds=3)
+    found = comparison.Comparison.load(name, None, None, None, seeds=3)
     assert found.data.exists() and found.scale.exists() and found.seeds == [0, 1, 2]
     assert all(Path(file).exists() for method in found.methods for file in found.configs(method))
     if name in ("table1", "table2", "demo"):
         assert set(found.methods) >= methods()  # and those that the tests above add
-    trained = [method for method in found.methods if compare.untrained(method) is None]
+    trained = [method for method in found.methods if comparison.untrained(method) is None]
     assert len(found.jobs()) == 3 * len(trained) + len(found.methods) - len(trained)

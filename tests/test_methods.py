@@ -16,7 +16,7 @@ from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.errors import UserError
-from nlt.evaluation.compare import untrained
+from nlt.evaluation.comparison import untrained
 from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule

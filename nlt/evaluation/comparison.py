@@ -1,0 +1,87 @@
+"""What a config of configs/compare asks for."""
+
+from __future__ import annotations
+
+import pydoc
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from nlt.data.spec import read_configs
+from nlt.errors import UserError
+from nlt.evaluation.paper import order, tables
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
+from nlt.paths import CONFIGS, config_names, find_config
+
+_KEYS = ("table", "data", "scale", "methods", "seed")
+
+
+@dataclass
+class Comparison:
+    """What a config of configs/compare asks for."""
+
+    name: str
+    data: Path
+    scale: Path
+    table: str | None = None
+    methods: list[str] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=lambda: [0])
+
+    @classmethod
+    def load(
+        cls, config: str, scale: str | None, data: str | None, methods: list[str] | None, seeds: int = 1
+    ) -> Comparison:
+        """Read a config by name or path; the other arguments override it.
+
+        Raises:
+            UserError: an unknown key, table, method or file.
+        """
+        file = find_config("compare", config)
+        content = read_configs([str(file)])
+        for key in content:
+            if key not in _KEYS:
+                raise UserError(f"{file}: {key}: unknown key; known are {', '.join(_KEYS)}")
+        for key, value in (("data", data), ("scale", scale)):
+            content[key] = value or content.get(key)
+            if not isinstance(content[key], str):
+                raise UserError(f"{file}: {key}: missing; name a config of configs/{key}")
+        table, seed = content.get("table"), content.get("seed", 0)
+        if table is not None and table not in tables():
+            raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise UserError(f"{file}: seed: must be a whole number of at least 0, is {seed!r}")
+        known = sorted(config_names("model"), key=order)
+        # Those in folders belong to a comparison that names them.
+        wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
+        for method in wanted:
+            if method not in known:
+                raise UserError(f"{file}: methods: no method {method!r} in configs/model; known are {', '.join(known)}")
+        return cls(
+            name=file.stem,
+            data=find_config("data", content["data"]),
+            scale=find_config("scale", content["scale"]),
+            table=table,
+            methods=sorted(wanted, key=order),
+            seeds=list(range(seed, seed + seeds)),
+        )
+
+    def jobs(self) -> list[tuple[str, int]]:
+        """The rows to make: a method and a seed each; what is not trained has one seed."""
+        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if untrained(m) else self.seeds)]
+
+    def configs(self, method: str) -> list[str]:
+        """The config files of a method's training, in order."""
+        return [str(self.data), str(CONFIGS / "model" / f"{method}.yaml"), str(self.scale)]
+
+
+def untrained(method: str) -> Method | None:
+    """The method, if its class is one that needs no training; None for one that does."""
+    file = CONFIGS / "model" / f"{method}.yaml"
+    model = read_configs([str(file)]).get("model", {})
+    kind = pydoc.locate(str(model.get("class_path")))
+    if not (isinstance(kind, type) and issubclass(kind, Method)) or issubclass(kind, RenderingModule):
+        return None  # what it is that is no class at all, training will say
+    try:
+        return kind(**model.get("init_args", {}))
+    except TypeError as error:
+        raise UserError(f"{file}: model.init_args: {error}") from None

@@ -1,0 +1,101 @@
+"""A method's images of the test split, judged by one set of metrics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, default_collate
+
+from nlt.data.dataset import LightTransportDataset
+from nlt.errors import DivergedError
+from nlt.evaluation.frames import Frames
+from nlt.evaluation.results import write_images
+from nlt.metrics.image_metrics import ImageMetrics
+from nlt.metrics.jackknife import fid_and_kid_without
+from nlt.models.method import Batch, Method
+from nlt.models.module import PROJECTION
+from nlt.models.projection import visible_pixels
+
+_SHOWN = 32  # test views whose images are kept
+_BATCH = 16
+_MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept for the next method
+
+
+class Evaluation:
+    """The test split, judged by one set of metrics; reference features are computed once for all methods."""
+
+    def __init__(self, frames: Frames, device: torch.device) -> None:
+        self.frames, self.device = frames, device
+        self.directory, self.spec = frames.dataset.directory, frames.dataset.spec
+        self._features: dict[int, dict[str, Tensor] | None] = {}
+        self.shown = list(range(0, len(self), max(1, len(self) // _SHOWN)))[:_SHOWN]
+
+    def __len__(self) -> int:
+        return self.spec.test * len(self.spec.scenes)
+
+    def write_references(self, directory: Path) -> None:
+        """images/reference.npz, noisy.npz and gbuffer.npz of the shown views."""
+        samples = [self.frames.dataset[k] for k in self.shown]
+        stack = {name: np.stack([sample[name].numpy() for sample in samples]) for name in samples[0]}
+        reference = (stack["reference_a"] + stack["reference_b"]) / 2
+        view = np.array(self.shown)
+        write_images(directory, "reference", radiance=reference, exposure=stack["exposure"], view=view)
+        write_images(directory, "noisy", radiance=stack["noisy"])
+        buffers = {name: stack[name] for name in ("albedo", "normal", "depth")}
+        write_images(directory, "gbuffer", **buffers, light_in_view=self._light_in_view(samples))
+
+    @staticmethod
+    def _light_in_view(samples: list[Batch]) -> np.ndarray:
+        """(V,) bool: a point that emits light is seen in the sample's image."""
+        batch = default_collate(samples)
+        camera = {name: batch[name] for name in PROJECTION}
+        emits = batch["point_visible"] & (batch["point_emission"] > 0).any(-1)
+        pixels = visible_pixels(batch["point_position"], emits, **camera)
+        return (pixels < batch["depth"][0].numel()).any(1).numpy()
+
+    @torch.inference_mode()
+    def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
+        """All metrics of a method; those of each view; its radiance (V, 3, H, W) of the views that are shown.
+
+        Raises:
+            DivergedError: a prediction is not finite.
+        """
+        method = method.to(self.device).eval()
+        metrics = ImageMetrics(perceptual=True).to(self.device)
+        dataset = LightTransportDataset(self.directory, self.spec, "test", method.inputs)
+        shown, rows = [], []
+        pools: list[tuple[Tensor, Tensor]] = []
+        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH)):
+            indices = cpu_batch["index"].tolist()
+            if "traced" in method.inputs and method.spp:
+                cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
+            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
+            prediction = method(batch)
+            if not prediction.isfinite().all():
+                raise DivergedError(f"a prediction is not finite, among test samples {indices}")
+            reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
+            of_reference = self._of_reference(k, reference)
+            each = metrics.update(prediction, *reference, of_reference=of_reference)
+            if of_reference and "pool" in each:
+                pools.append((each.pop("pool"), of_reference["pool"]))
+            columns = {name: values.tolist() for name, values in each.items()}
+            rows += [{"view": index, **{n: c[i] for n, c in columns.items()}} for i, index in enumerate(indices)]
+            shown.append(prediction[[i for i, index in enumerate(indices) if index in self.shown]].cpu())
+        if pools:
+            without = fid_and_kid_without(*(torch.cat(part) for part in zip(*pools, strict=True)))
+            for key, column in without.items():
+                for row, value in zip(rows, column.tolist(), strict=True):
+                    row[key] = value
+        values = {name: float(value) for name, value in metrics.compute().items()}
+        return values, rows, torch.cat(shown).numpy()
+
+    def _of_reference(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
+        if len(self) > _MAX_CACHED:
+            return ImageMetrics.reference_features(*reference)
+        if k not in self._features:
+            self._features[k] = ImageMetrics.reference_features(*reference)
+        return self._features[k]
