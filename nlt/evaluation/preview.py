@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from nlt.data.engines import Process
 from nlt.metrics.display import display
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
@@ -40,16 +39,14 @@ def contact_sheet(
     sheet = Image.new("RGB", (width, len(names) * height), "white")
     draw = ImageDraw.Draw(sheet)
     choose_variant()  # once; the processes inherit it
-    context = multiprocessing.get_context("spawn")
     # A process per scene: Mitsuba's memory grows with every one.
-    with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
-        for row, (name, description) in enumerate(zip(names, descriptions, strict=True)):
-            images = pool.submit(_images, name, views, resolution, spp, experiment, seed).result()
-            title = f"{name} ({experiment.replace('_', ' ')}, exposure {description.exposure:g}, {spp} spp)"
-            draw.text((_GAP, row * height + _GAP), title, "black", font_size=14)
-            for column, image in enumerate(images):
-                corner = (_GAP + column * (resolution + _GAP), row * height + _TITLE)
-                sheet.paste(Image.fromarray(image), corner)
+    for row, (name, description) in enumerate(zip(names, descriptions, strict=True)):
+        images = Process(_images, name, views, resolution, spp, experiment, seed).result()
+        title = f"{name} ({experiment.replace('_', ' ')}, exposure {description.exposure:g}, {spp} spp)"
+        draw.text((_GAP, row * height + _GAP), title, "black", font_size=14)
+        for column, image in enumerate(images):
+            corner = (_GAP + column * (resolution + _GAP), row * height + _TITLE)
+            sheet.paste(Image.fromarray(image), corner)
     output.parent.mkdir(parents=True, exist_ok=True)
     sheet.save(output, optimize=True, quality=90)  # of a JPEG; noise makes a PNG five times as large
 

@@ -9,9 +9,7 @@ is the variance after the display transform, in which fireflies are clipped.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ import numpy as np
 import torch
 from scipy import stats
 
+from nlt.data.engines import Process
 from nlt.data.files import write_bytes
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
@@ -68,14 +67,12 @@ def teachers(
         load_description(name)  # mistakes show before anything is rendered
     choose_variant()  # once; the processes inherit it
     rows = []
-    context = multiprocessing.get_context("spawn")
     # A process per scene: Mitsuba's memory grows with every one.
-    with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
-        for name in names:
-            rows.append(pool.submit(_measure, name, seconds, resolution, views, experiment, seed).result())
-            print(_line(rows[-1]), flush=True)
-            write_rows(out / "table.csv", rows)
-            write_bytes(out / "table.md", _markdown(rows).encode())
+    for name in names:
+        rows.append(Process(_measure, name, seconds, resolution, views, experiment, seed).result())
+        print(_line(rows[-1]), flush=True)
+        write_rows(out / "table.csv", rows)
+        write_bytes(out / "table.md", _markdown(rows).encode())
     _draw(out / "teachers.png", rows)
     settings = {"scenes": names, "seconds": seconds, "resolution": resolution, "views": views, "spp": _SPP}
     more = {"experiment": experiment, "seed": seed}
