@@ -64,8 +64,9 @@ class NeuralLightTransport(RenderingModule):
         point_features = self.pointnet(torch.cat([x.to(points[0].dtype) for x in points], dim=-1), visible)
         if self.photon_network is None:
             return point_features, None
-        flux = batch["photon_flux"]
-        colour = log_exposed(flux * flux.shape[1], exposure)  # times P: a photon carries 1/P of the power
+        # Times their number: a photon carries that share of the power that arrives.
+        power = batch["photon_flux"] * batch["photon_valid"].sum(1).view(-1, 1, 1)
+        colour = log_exposed(power, exposure)
         photons = torch.cat([batch["photon_origin"], batch["photon_direction"], colour], dim=-1)
         return point_features, self.photon_network(photons)
 
