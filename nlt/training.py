@@ -24,6 +24,7 @@ from nlt.errors import UserError
 from nlt.metrics.display import display
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
+from nlt.models.policy import Policy, default_device
 
 # Advice for other set-ups than ours; what it says is either decided on purpose or untrue here.
 _NOISE = (
@@ -171,6 +172,7 @@ def _with_place(message: str, given: dict[str, str], command: str) -> str:
 def trainer_defaults() -> dict[str, Any]:
     """What the trainer does unless a config says otherwise."""
     return {
+        "precision": "bf16-mixed" if Policy.for_device(default_device()).bfloat16 else "32-true",
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
         "default_root_dir": "runs",

@@ -16,6 +16,7 @@ from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import write_shard
+from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.training import run_lightning
@@ -104,6 +105,32 @@ def test_sample_that_is_not_finite(tiny, tmp_path, capfd):
     assert len(samples) == 2 and str(4 + 2) in samples
 
 
+def test_mixed_precision(tiny, tmp_path, monkeypatch):
+    """Where the device has bfloat16, layers use it; the weights and Adam's state do not, nor do the metrics."""
+    seen = {}
+
+    def step(self, batch, index):
+        loss = training_step(self, batch, index)
+        seen["training"] = torch.is_autocast_enabled("cpu"), self(batch).dtype, loss.dtype
+        return loss
+
+    def update(self, *images, **more):
+        seen["metrics"] = torch.is_autocast_enabled("cpu")
+        return metrics_update(self, *images, **more)
+
+    training_step, metrics_update = CNN.training_step, ImageMetrics.update
+    monkeypatch.setattr(CNN, "training_step", step)
+    monkeypatch.setattr(ImageMetrics, "update", update)
+    for has in (True, False):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {"avx512_bf16": has, "avx512_f": True})
+        trainer = run_lightning(tiny.command("fit", "cnn", f"--trainer.default_root_dir={tmp_path}")).trainer
+        assert seen == {"training": (has, torch.float32, torch.float32), "metrics": False}
+        checkpoint = torch.load(trainer.checkpoint_callback.best_model_path, weights_only=True)
+        state = checkpoint["optimizer_states"][0]["state"].values()
+        tensors = [*checkpoint["state_dict"].values(), *(moments["exp_avg"] for moments in state)]
+        assert {tensor.dtype for tensor in tensors} == {torch.float32}
+
+
 def test_events(tiny, trained):
     events = EventAccumulator(str(trained)).Reload()
     values = {tag: [event.value for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
@@ -131,7 +158,7 @@ def test_evaluation_commands(tiny, checkpoint, tmp_path, monkeypatch, capsys):
     assert all(value.isfinite() for value in logged.values())
 
     capsys.readouterr()
-    assert main(tiny.command("predict", "cnn", *place)) == 0
+    assert main(tiny.command("predict", "cnn", *place, "--trainer.precision=32-true")) == 0
     printed = capsys.readouterr().out.split()[-1]
     images = sorted((tmp_path / printed).iterdir())
     assert [image.name for image in images] == ["0000000.png", "0000001.png", "0000002.png"]

@@ -6,8 +6,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.generate import generate
 from nlt.data.spec import load_spec, read_configs
@@ -31,6 +29,7 @@ from nlt.evaluation.results import (
 )
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.evaluation.trainings import obtain
+from nlt.models.policy import default_device
 
 
 def compare(
@@ -49,7 +48,7 @@ def compare(
     if not spec.test:
         raise UserError(f"{comparison.scale}: data.dataset.test: is 0; a comparison needs test samples")
     dataset = generate(spec, root)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = default_device()
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
     test, clock = Evaluation(frames, device), Clock(frames, device)
     test.write_references(directory)

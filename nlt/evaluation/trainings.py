@@ -45,7 +45,9 @@ def train(comparison: Comparison, method: str, seed: int, root: Path) -> tuple[P
     """
     files = comparison.configs(method)
     merged = read_configs(files)
-    decides = {key: merged.get(key) for key in ("data", "model", "trainer")} | {"seed": seed}
+    precision = training.trainer_defaults()["precision"]
+    decides = {key: merged.get(key) for key in ("data", "model")} | {"seed": seed}
+    decides["trainer"] = {"precision": precision, **merged.get("trainer", {})}
     key = hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
     run = root / f"{method}-{key}"
     done = run / "done.json"

@@ -131,12 +131,13 @@ class RenderingModule(Method, L.LightningModule):
         return loss
 
     def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.hparams["learning_rate"])
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.hparams["learning_rate"], fused=True)
         return [optimizer], [ExponentialLR(optimizer, gamma=self.hparams["lr_decay"])]
 
     def _evaluation_step(self, batch: Batch) -> Tensor:
         prediction = self(batch)
-        self._metrics[0].update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"])
+        with torch.autocast(prediction.device.type, enabled=False):  # which is for methods, not their judge
+            self._metrics[0].update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"])
         return prediction
 
     def _log_metrics(self, prefix: str) -> None:

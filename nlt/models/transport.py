@@ -42,7 +42,8 @@ class ResidualBlock(nn.Module):
 
 def masked_max(x: Tensor, mask: Tensor) -> Tensor:
     """Maximum of x (B, N, C) over the points in mask (B, N) bool: (B, C), zero where the mask is empty."""
-    maximum = x.masked_fill(~mask[..., None], -torch.inf).amax(dim=1)
+    hide = torch.where(mask, 0.0, -torch.inf).to(x.dtype)
+    maximum = (x + hide[..., None]).max(dim=1).values  # not amax, whose gradient reads all of x to find ties
     return torch.where(mask.any(dim=1, keepdim=True), maximum, 0)
 
 
