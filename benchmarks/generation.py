@@ -36,69 +36,13 @@ from nlt.data.engines import Process, cores
 from nlt.data.generate import generate, render_shard
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, Shard
+from nlt.evaluation.bare import Bare
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.paths import PROJECT
 from nlt.scenes.assembly import load_source
-from nlt.scenes.camera import Camera
 from nlt.scenes.description import MOVING_LIGHT
 
 SPLITS = ("train", "test")
-
-
-class Bare:
-    """A plain loop of Mitsuba's own calls; no code of ours but moving the objects.
-
-    As a user writes it first, every call traces its kernel anew before it finds it compiled, which at small sizes
-    takes most of the time; `frozen` is for the user who knows of `dr.freeze`.
-    """
-
-    def __init__(self, render: SampleRenderer, frozen: bool) -> None:
-        freeze: Callable = dr.freeze if frozen and dr.is_jit_v(mi.Float) else lambda function: function
-        self._image, self._cast = freeze(_image), freeze(_cast)
-        self.spec, self.scene = render.spec, render.scene
-        self.path = render.renderer.integrator
-        self.aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,normal:sh_normal,albedo:albedo"})
-        size = render.spec.resolution
-        film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-        fov = render.description.fov
-        self.sensor = mi.load_dict({"type": "perspective", "near_clip": 1e-4, "fov": fov, "film": film})
-        self.view = mi.traverse(self.sensor)
-
-    def sample(self, state: Any, camera: Camera, split: str, seed: int) -> None:
-        self.scene.set_state(state)
-        to_world = np.linalg.inv(camera.world_to_view.astype(float))
-        to_world[:3, 3] *= self.scene.description.units_per_metre
-        self.view["to_world"] = mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1, 1, 1]))
-        self.view.update()
-        references = [] if split == "train" else [self.spec.reference_spp] * 2
-        for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, *references)):
-            self._render(self.path, spp, seed * 8 + k)
-        self._render(self.aov, 1, seed)
-        self._photons(seed)
-
-    def _render(self, integrator: Any, spp: int, seed: int) -> np.ndarray:
-        seeds = dr.opaque(mi.UInt32, seed) if dr.is_jit_v(mi.Float) else seed
-        return np.array(self._image(self.scene.mi_scene, self.sensor, integrator, spp, seeds))
-
-    def _photons(self, seed: int) -> None:
-        count = self.spec.photons if dr.is_jit_v(mi.Float) else 1
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count)
-        for _ in range(self.spec.photons // count):
-            for value in self._cast(self.scene.mi_scene, sampler):
-                np.array(value)
-
-
-def _image(scene: Any, sensor: Any, integrator: Any, spp: int, seed: Any) -> Any:
-    return mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-
-
-def _cast(scene: Any, sampler: Any) -> tuple:
-    ray, weight, _ = scene.sample_emitter_ray(
-        mi.Float(0), sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True
-    )
-    hit = scene.ray_intersect(ray)
-    return ray.o, ray.d, weight, hit.p, hit.is_valid()
 
 
 def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[str, Any]:

@@ -61,6 +61,8 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.compare import compare
 
         compare(options.config, options.out, options.scale, options.data, options.methods, options.seeds)
+    elif options.command == "bench":
+        _bench(options)
     elif options.command == "report":
         from nlt.evaluation.report import draw
 
@@ -77,6 +79,22 @@ def _run(arguments: list[str]) -> int:
         size = options.resolution
         teachers(options.names, options.out, options.seconds, size, options.views, options.experiment, options.seed)
     return 0
+
+
+def _bench(options: argparse.Namespace) -> None:
+    from nlt.evaluation.bench import bench
+
+    bench(
+        out=options.out,
+        data=options.data,
+        scale=options.scale,
+        methods=options.methods,
+        changed=dict(options.set),
+        checkpoint=options.ckpt,
+        device=options.device,
+        seconds=options.seconds,
+        growth=["nlt_photons"] if options.growth == [] else options.growth,
+    )
 
 
 def _scenes(options: argparse.Namespace) -> None:
@@ -130,6 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
+    _add_bench(commands.add_parser("bench", help="what a frame, a training step and a sample cost, stage by stage"))
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
     board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")
@@ -144,6 +163,24 @@ def _parser() -> argparse.ArgumentParser:
     teachers.add_argument("--seed", type=int, default=0)
     _add_scenes(commands.add_parser("scenes", help="scenes: list, show, check, preview, add"))
     return parser
+
+
+def _add_bench(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", default="demo", help="a config of configs/data, by name or path (default: demo)")
+    parser.add_argument("--scale", default="demo", help="a config of configs/scale (default: demo)")
+    parser.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    parser.add_argument(
+        "--set", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
+        help="resolution, points, photons, width, depth, batch_size, workers of the configs; batch: frames at once",
+    )  # fmt: skip
+    parser.add_argument("--ckpt", help="weights of the one method (default: random ones)")
+    parser.add_argument("--device", help="cpu or cuda (default: cuda, if there is one)")
+    parser.add_argument("--seconds", type=_positive, default=20, help="that a measurement may take (default: 20)")
+    parser.add_argument(
+        "--growth", nargs="*", metavar="METHOD",
+        help="cost over resolution, points, photons, width and batch (default: none; without a name, of nlt_photons)",
+    )  # fmt: skip
+    parser.add_argument("--out", default="results/bench", help="where the results go (default: results/bench)")
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:

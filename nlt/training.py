@@ -105,16 +105,21 @@ class NLTCLI(LightningCLI):
             raise UserError(_one_line(str(error))) from None
 
 
+def quiet() -> None:
+    """Lightning says what is wrong, and no more."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for pattern in _NOISE:
+        warnings.filterwarnings("ignore", pattern)
+
+
 def run_lightning(arguments: list[str]) -> NLTCLI:
     """Run a subcommand such as `fit --config ...` and return what it made.
 
     Raises:
         UserError: a config, a checkpoint or the dataset is wrong.
     """
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    for pattern in _NOISE:
-        warnings.filterwarnings("ignore", pattern)
+    quiet()
     given = _check_configs(arguments)
     try:
         return NLTCLI(

@@ -21,7 +21,10 @@ from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
+from nlt.models.plain import plain
 from nlt.paths import config_names, find_config
+
+pytest_plugins = ["training_fixtures"]
 
 UNTRAINED = [name for name in config_names("model") if untrained(name)]
 CONFIGS = [find_config("model", name) for name in config_names("model") if name not in UNTRAINED]
@@ -51,6 +54,14 @@ def trainer(path: Path, **kwargs) -> L.Trainer:
 
 def loader(*batches: dict[str, torch.Tensor]) -> DataLoader:
     return DataLoader(list(batches), batch_size=None)
+
+
+def test_the_plain_path_makes_the_same_image(method, one_thread):
+    batch = {k: v.double() if v.is_floating_point() else v for k, v in synthetic_batch(size=24).items()}
+    slow = plain(method).double().eval()
+    with torch.no_grad():
+        torch.testing.assert_close(slow(batch), method.double().eval()(batch), rtol=1e-9, atol=1e-12)
+    assert type(slow).project is not type(method).project
 
 
 def test_one_training_step_reaches_every_parameter(method):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from nlt.models import plain
 from nlt.models.projection import project, visible_pixels
 
 H, W = 12, 16
@@ -71,7 +72,8 @@ def brute_force(features, positions, valid, matrix, view, depth, normal, epsilon
     return total / np.maximum(count, 1), count
 
 
-def test_equals_the_loop_over_points():
+@pytest.mark.parametrize("project", [project, plain.project], ids=["usual", "plain"])
+def test_equals_the_loop_over_points(project):
     arguments = scene()
     expected, count = brute_force(*(a.numpy() for a in arguments))
     result = project(*arguments)

@@ -99,8 +99,8 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
     print(f"{directory}: {sum(samples.values())} samples to render, {engine.workers} side by side, {cost}", flush=True)
 
 
-def _plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
-    """What is missing, dealt out to jobs."""
+def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
+    """The files that are missing, dealt out to jobs."""
     jobs, shards = [], _shards(spec, missing)
     for scene in range(len(spec.scenes)):
         mine = [shard for shard in shards if shard.scene == scene]
@@ -122,7 +122,7 @@ def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) 
         for _ in range(2):
             before = left()
             try:
-                with closing(engine.run(work, _plan(spec, missing_files(directory, spec), engine.workers))) as ticks:
+                with closing(engine.run(work, plan(spec, missing_files(directory, spec), engine.workers))) as ticks:
                     for ticked in ticks:
                         bar.update(total - (left() if ticked is None else before - ticked) - bar.n)
                 died = None
@@ -139,8 +139,11 @@ def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) 
 def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int, tick: Callable[[int], None]) -> None:
     """A job, in a process of its own."""
     os.environ["NLT_VARIANT"] = variant  # the same on every machine
-    directory = open_path(place)
-    render = SampleRenderer(spec, job.scene, threads)
+    fill(SampleRenderer(spec, job.scene, threads), open_path(place), job, tick)
+
+
+def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:
+    """Render a job of `render`'s scene and write it; `tick(n)` is called after every n samples."""
     if job.points:
         write_shard(directory / points_name(job.scene), [render.points()])
     for shard in job.shards:

@@ -102,19 +102,20 @@ def _time(spec: DatasetSpec, scene: int, threads: int, began: float) -> dict[str
     render = SampleRenderer(spec, scene, threads)
     sample = render.sample("train", 0)
     with tempfile.TemporaryDirectory() as folder:
-        frames = [_frame(render, k, lambda: write_shard(Path(folder) / "shard", [sample])) for k in range(spec.train)]
+        frames = [laps(render, k, lambda: write_shard(Path(folder) / "shard", [sample])) for k in range(spec.train)]
     seconds = {stage: float(np.mean([frame[stage] for frame in frames[_WARM_UP:]])) for stage in STAGES}
     start = time.time() - began - sum(seconds.values()) * len(frames)
-    seconds["reference"] *= 2 * spec.reference_spp / _timed_spp(spec)
+    seconds["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
     return seconds | {"start": start}
 
 
-def _timed_spp(spec: DatasetSpec) -> int:
+def timed_spp(spec: DatasetSpec) -> int:
+    """Samples per pixel at which the reference is timed; its seconds are in proportion."""
     return min(spec.reference_spp, _MOST_SPP)
 
 
-def _frame(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str, float]:
-    """Seconds by stage of a sample, its reference one half at `_timed_spp`."""
+def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str, float]:
+    """Seconds by stage of a training sample, and of one half of a reference at `timed_spp`; `store` is timed too."""
     spec, trace = render.spec, render.renderer
     seconds: dict[str, float] = {}
 
@@ -129,6 +130,6 @@ def _frame(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[st
     lap("noisy_input", lambda: trace.radiance(camera, spec.input_spp, k))
     lap("G-buffer", lambda: trace.gbuffer(camera))
     lap("photons", lambda: trace.photons(spec.photons, k))
-    lap("reference", lambda: trace.radiance(camera, _timed_spp(spec), k))
+    lap("reference", lambda: trace.radiance(camera, timed_spp(spec), k))
     lap("storing", store)
     return seconds

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,79 +15,89 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torch.utils.data import default_collate
 from torch.utils.flop_counter import FlopCounterMode
 
 from nlt.evaluation.frames import Frames
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
 
-WARM_UP, FRAMES = 10, 40
+WARM_UP, FRAMES, LEAST_FRAMES = 10, 40, 3
+_WARM_UP_SHARE = 0.2  # of a limited time
 
 
 class Clock:
-    """Measures methods on the same frames: test samples, each with its own state and view.
+    """Measures methods on the same frames: a dataset's samples, each with its own state and view.
 
     What is charged is what a renderer would pay for a new frame: G-buffer, photon casting, path tracing of the
     pixels that the method is fed with, light transport, projection and synthesis or denoising. Not charged,
     being the same for all methods: moving the scene's objects.
+
+    `batch`: how many frames are made at once.
     """
 
-    def __init__(self, frames: Frames, device: torch.device) -> None:
-        self.frames, self.dataset, self.device = frames, frames.dataset, device
+    def __init__(self, frames: Frames, device: torch.device, batch: int = 1) -> None:
+        self.frames, self.dataset, self.device, self.batch = frames, frames.dataset, device, batch
 
     def time(self, method: Method) -> dict[str, Any]:
-        """Seconds: median and p95 by stage; `time_per_frame_s` is the sum of the stages' medians.
+        """Seconds by stage and of the frame, as `summary` says; warm-up 10 frames, then 40 timed ones."""
+        return summary(self.race({"": method})[""])
 
-        Warm-up 10 frames, then 40 timed ones, the device synchronised around every stage.
-        `time_per_frame_error_s` is its standard error, bootstrapped over the frames.
+    @torch.inference_mode()
+    def race(self, methods: Mapping[str, Method], seconds: float = math.inf) -> dict[str, list[dict[str, float]]]:
+        """Seconds by stage of every timed frame, by method; the device is synchronised around every stage.
+
+        The methods take turns at each frame, so that whatever else the machine does slows all. Warm-up 10 frames, then
+        40 timed ones; when `seconds` are over, fewer, but 1 and 3 at least.
         """
-        method = method.to(self.device).eval()
+        methods = {name: method.to(self.device).eval() for name, method in methods.items()}
         rows = np.linspace(0, len(self.dataset) - 1, min(len(self.dataset), WARM_UP + FRAMES)).astype(int)
-        timed: list[dict[str, float]] = []
-        with torch.inference_mode():
-            for k in range(WARM_UP + FRAMES):
-                timed.append(self._frame(method, int(rows[k % len(rows)])))
-        stages = {name: np.array([frame[name] for frame in timed[WARM_UP:]]) for name in timed[0]}
-        result = {f"{name}_s": float(np.median(seconds)) for name, seconds in stages.items()}
-        result["time_per_frame_s"] = sum(result.values())
-        total = lambda *seconds, axis: sum(np.median(s, axis=axis) for s in seconds)
-        spread = scipy.stats.bootstrap(
-            tuple(stages.values()), total, paired=True, n_resamples=200, method="basic", rng=np.random.default_rng(0)
-        )
-        result["time_per_frame_error_s"] = float(spread.standard_error)
-        result |= {f"{name}_p95_s": float(np.percentile(seconds, 95)) for name, seconds in stages.items()}
-        result["time_per_frame_p95_s"] = float(np.percentile(sum(stages.values()), 95))
-        return result
+        timed: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
+        begin, number = time.perf_counter(), 0
+        for most, least, share in ((WARM_UP, 1, _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
+            for laps in timed.values():
+                laps.clear()
+            for k in range(most):
+                if k >= least and time.perf_counter() - begin > share * seconds:
+                    break
+                indices = [int(rows[(number + j) % len(rows)]) for j in range(self.batch)]
+                number += self.batch
+                for name, method in methods.items():
+                    timed[name].append(self._frame(method, indices))
+        return timed
 
-    def _frame(self, method: Method, index: int) -> dict[str, float]:
-        renderer, camera = self.frames.place(index)
-        batch, spec = self._batch(index), self.dataset.spec
+    def _frame(self, method: Method, indices: Sequence[int]) -> dict[str, float]:
+        batch, spec = self._batch(indices), self.dataset.spec
         seconds: dict[str, float] = {}
-        if "gbuffer" in method.stages:
-            self._lap(seconds, "gbuffer", lambda: renderer.gbuffer(camera))
-        if "photons" in method.stages:
-            self._lap(seconds, "photons", lambda: renderer.photons(spec.photons, index))
-        if "path_tracing" in method.stages:
-            mask = method.mask(batch, camera.height, camera.width)
-            pixels = None if method.pixel_fraction == 1 else mask[0, 0].flatten().nonzero()[:, 0].cpu().numpy()
-            spp = method.spp or spec.input_spp
-            traced = self._lap(seconds, "path_tracing", lambda: renderer.radiance(camera, spp, index, pixels))
-            if "traced" in method.inputs:
-                batch["traced"] = torch.from_numpy(traced)[None].to(self.device)
+        mask = method.mask(batch, spec.resolution, spec.resolution)
+        traced = []
+        for row, index in enumerate(indices):
+            renderer, camera = self.frames.place(index)
+            if "gbuffer" in method.stages:
+                self._lap(seconds, "gbuffer", partial(renderer.gbuffer, camera))
+            if "photons" in method.stages:
+                self._lap(seconds, "photons", partial(renderer.photons, spec.photons, index))
+            if "path_tracing" in method.stages:
+                pixels = None if method.pixel_fraction == 1 else mask[row, 0].flatten().nonzero()[:, 0].cpu().numpy()
+                spp = method.spp or spec.input_spp
+                work = partial(renderer.radiance, camera, spp, index, pixels)
+                traced.append(self._lap(seconds, "path_tracing", work))
+        if "traced" in method.inputs:
+            batch["traced"] = torch.from_numpy(np.stack(traced)).to(self.device)
         result: Any = None
         for name, step in method.steps().items():
             result = self._lap(seconds, name, partial(step, batch, result))
         return seconds
 
-    def _batch(self, index: int) -> Batch:
-        return {k: v[None].to(self.device) for k, v in self.dataset[index].items()}
+    def _batch(self, indices: Sequence[int]) -> Batch:
+        return {k: v.to(self.device) for k, v in default_collate([self.dataset[index] for index in indices]).items()}
 
     def _lap(self, seconds: dict[str, float], stage: str, work: Callable[[], Any]) -> Any:
         self._synchronize()
         start = time.perf_counter()
         result = work()
         self._synchronize()
-        seconds[stage] = time.perf_counter() - start
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
         return result
 
     def _synchronize(self) -> None:
@@ -94,7 +105,7 @@ class Clock:
             torch.cuda.synchronize(self.device)
 
     def size(self, method: Method) -> dict[str, Any]:
-        """Parameters; FLOPs of a frame's convolutions and matrix products; peak memory of its computation.
+        """Parameters; FLOPs of a batch's convolutions and matrix products; peak memory of its computation.
 
         The renderer's share is not in it, so a method that computes nothing by PyTorch has neither of the latter.
         The memory is that of parameters, inputs and, of what is computed, the most that is alive at once; on
@@ -105,11 +116,8 @@ class Clock:
         if not isinstance(method, RenderingModule):
             return sizes
         method = method.to(self.device).eval()
-        batch = {name: value for name, value in self._batch(0).items() if name in (*method.inputs, "exposure", "scene")}
-        flops, memory = FlopCounterMode(display=False), _AliveMemory()
-        batch["index"] = torch.zeros_like(batch["scene"])
-        with torch.no_grad(), flops:
-            method(batch)
+        batch = self._inputs(method)
+        memory = _AliveMemory()
         cuda = self.device.type == "cuda"
         if cuda:
             torch.cuda.reset_peak_memory_stats(self.device)
@@ -118,7 +126,41 @@ class Clock:
             method(batch)
         peak = torch.cuda.max_memory_allocated(self.device) - before if cuda else memory.peak
         held = sum(t.numel() * t.element_size() for t in [*parameters, *batch.values()])
-        return sizes | {"flops": flops.get_total_flops(), "peak_memory_bytes": held + peak}
+        return sizes | {"flops": sum(self.flops(method).values()), "peak_memory_bytes": held + peak}
+
+    @torch.no_grad()
+    def flops(self, method: RenderingModule) -> dict[str, int]:
+        """Floating-point operations of a batch's convolutions and matrix products, by step."""
+        batch, result, flops = self._inputs(method), None, {}
+        for name, step in method.to(self.device).eval().steps().items():
+            with FlopCounterMode(display=False) as counter:
+                result = step(batch, result)
+            flops[name] = counter.get_total_flops()
+        return flops
+
+    def _inputs(self, method: Method) -> Batch:
+        """A batch with what the method reads and no more."""
+        whole = self._batch([k % len(self.dataset) for k in range(self.batch)])
+        batch = {name: value for name, value in whole.items() if name in (*method.inputs, "exposure", "scene")}
+        return batch | {"index": torch.zeros_like(batch["scene"])}
+
+
+def summary(laps: list[dict[str, float]]) -> dict[str, Any]:
+    """Of timed frames, in seconds: median and p95 by stage; `time_per_frame_s` is the sum of the stages' medians.
+
+    `time_per_frame_error_s` is its standard error, bootstrapped over the frames.
+    """
+    stages = {name: np.array([frame[name] for frame in laps]) for name in laps[0]}
+    result = {f"{name}_s": float(np.median(seconds)) for name, seconds in stages.items()}
+    result["time_per_frame_s"] = sum(result.values())
+    total = lambda *seconds, axis: sum(np.median(s, axis=axis) for s in seconds)
+    spread = scipy.stats.bootstrap(
+        tuple(stages.values()), total, paired=True, n_resamples=200, method="basic", rng=np.random.default_rng(0)
+    )
+    result["time_per_frame_error_s"] = float(spread.standard_error)
+    result |= {f"{name}_p95_s": float(np.percentile(seconds, 95)) for name, seconds in stages.items()}
+    result["time_per_frame_p95_s"] = float(np.percentile(sum(stages.values()), 95))
+    return result
 
 
 class _AliveMemory(TorchDispatchMode):

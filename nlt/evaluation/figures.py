@@ -31,8 +31,8 @@ _ROWS = 6  # views in samples.png
 # The supplementary's six panels, and two.
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 # Okabe and Ito's colours, which the colour-blind tell apart; markers and dashes for print without colour.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-_MARKERS, _DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 _CURVES = ("0.3", "#8C510A", "#000000")
 _HALO = [withStroke(linewidth=1.5, foreground="white")]
 
@@ -53,7 +53,7 @@ def draw_samples(results: Results) -> None:
     for column, images in enumerate(columns.values()):
         for row, view in enumerate(rows):
             axes[row][column].imshow(shown(images[view], reference["exposure"][view]), interpolation="nearest")
-    save(figure, results, "samples", ("png",))
+    save(figure, results.directory, "samples", ("png",))
 
 
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
@@ -68,11 +68,11 @@ def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figur
     return figure, axes
 
 
-def save(figure: plt.Figure, results: Results, name: str, kinds: tuple[str, ...] = ("png", "svg")) -> None:
-    """Into the results' directory; the same figure gives the same bytes."""
+def save(figure: plt.Figure, directory: Path, name: str, kinds: tuple[str, ...] = ("png", "svg")) -> None:
+    """Into a directory of results; the same figure gives the same bytes."""
     for kind in kinds:
         metadata = {"png": {"Software": None}, "svg": {"Date": None}}[kind]
-        figure.savefig(results.directory / f"{name}.{kind}", dpi=150, metadata=metadata)
+        figure.savefig(directory / f"{name}.{kind}", dpi=150, metadata=metadata)
     plt.close(figure)
 
 
@@ -162,14 +162,14 @@ def draw_speed_accuracy(results: Results) -> None:
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
         for k, (name, members) in enumerate(families.items()):
             found = [m for m in members if m in at]
-            style = {"color": _CURVES[k % len(_CURVES)], "ls": _DASHES[k % 4], "marker": "x+."[k % 3]}
+            style = {"color": _CURVES[k % len(_CURVES)], "ls": DASHES[k % 4], "marker": "x+."[k % 3]}
             _plot(axis, results, key, found, at, name, style)
             for number, m in enumerate(found):
                 part = label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
                 axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
                               fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
         for k, m in enumerate(m for m in points if m in at):
-            style = {"color": _COLOURS[k % len(_COLOURS)], "ls": "", "marker": _MARKERS[k % len(_MARKERS)]}
+            style = {"color": COLOURS[k % len(COLOURS)], "ls": "", "marker": MARKERS[k % len(MARKERS)]}
             _plot(axis, results, key, [m], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3})
         axis.set_xscale("log")
         axis.margins(0.09, 0.12)
@@ -184,7 +184,7 @@ def draw_speed_accuracy(results: Results) -> None:
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), fontsize=8, frameon=False)
     figure.tight_layout(rect=(0, 0.01 + 0.03 * math.ceil(len(labels) / 6), 1, 1))
-    save(figure, results, "speed_accuracy")
+    save(figure, results.directory, "speed_accuracy")
 
 
 def _plot(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -14,11 +15,14 @@ from nlt.scenes.camera import Camera
 
 
 class Frames:
-    """The samples of a dataset's split; a scene is loaded when one of its samples is first asked for."""
+    """The samples of a dataset's split; a scene is loaded when one of its samples is first asked for.
 
-    def __init__(self, dataset: LightTransportDataset) -> None:
+    `renderer`: what gives the renderer of a scene in place of loading it.
+    """
+
+    def __init__(self, dataset: LightTransportDataset, renderer: Callable[[int], SampleRenderer] | None = None) -> None:
         self.dataset = dataset
-        self._renderer = cache(lambda scene: SampleRenderer(dataset.spec, scene))
+        self._renderer = renderer or cache(lambda scene: SampleRenderer(dataset.spec, scene))
         self.traced = cache(self._traced)
 
     def place(self, index: int) -> tuple[Renderer, Camera]:

@@ -125,7 +125,7 @@ def draw_qualitative(images: Shown) -> None:
     figure.colorbar(drawn, cax=bar).ax.tick_params(labelsize=5)
     axes[-1][-1].text(0.65, 0.5, "error, one scale", fontsize=5, rotation=90, va="center", ha="center",
                       transform=axes[-1][-1].transAxes)  # fmt: skip
-    save(figure, images.results, "qualitative", ("png",))
+    save(figure, images.results.directory, "qualitative", ("png",))
 
 
 def worst_pixels(images: Shown, method: str) -> np.ndarray:
@@ -159,7 +159,7 @@ def draw_failures(images: Shown) -> None:
             })  # fmt: skip
     handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in CAUSES.values()]
     figure.legend(handles, CAUSES, loc="lower center", ncols=len(CAUSES), fontsize=7, frameon=False)
-    save(figure, images.results, "failures", ("png",))
+    save(figure, images.results.directory, "failures", ("png",))
     write_rows(images.results.directory / "failures.csv", rows)
     write_bytes(images.results.directory / "failures.md", _failures_markdown(images, rows).encode())
 

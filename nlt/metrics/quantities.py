@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 # The stages of a frame: rendered, then computed. A method pays for those it needs.
-STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
+RENDERED_STAGES = ("gbuffer", "photons", "path_tracing")
+NETWORK_STAGES = ("transport", "projection", "synthesis")
+STAGES = (*RENDERED_STAGES, *NETWORK_STAGES, "denoise")
 INCEPTION_STAGES = ("layer0", "layer1", "layer2", "layer3")
 
 

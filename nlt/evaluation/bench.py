@@ -1,0 +1,502 @@
+"""`nlt bench`: what a frame, a training step and a sample cost, beside the plain path and the machine's ceilings."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pydoc
+import shutil
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from nlt.data.datamodule import LightTransportDataModule
+from nlt.data.dataset import LightTransportDataset
+from nlt.data.files import write_bytes
+from nlt.data.generate import fill, plan
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec, load_spec, read_configs
+from nlt.data.stats import laps, timed_spp
+from nlt.data.store import missing_files, write_manifest, write_shard
+from nlt.errors import UserError
+from nlt.evaluation import ceilings
+from nlt.evaluation.bare import Bare
+from nlt.evaluation.bench_report import BENCH, write_report
+from nlt.evaluation.clock import LEAST_FRAMES, Clock, summary
+from nlt.evaluation.comparison import untrained
+from nlt.evaluation.frames import Frames
+from nlt.evaluation.paper import order
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.metrics.quantities import NETWORK_STAGES
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
+from nlt.models.plain import plain
+from nlt.models.policy import default_device
+from nlt.paths import config_names, find_config
+from nlt.rendering.variant import choose_variant
+from nlt.training import quiet, trainer_defaults
+
+# What may be set: of the dataset, the model, the training, and how many frames are made at once.
+_DATASET, _MODEL, _DATA = ("resolution", "points", "photons"), ("width", "depth"), ("batch_size", "workers")
+SETTINGS = (*_DATASET, *_MODEL, *_DATA, "batch")
+# What costs are drawn over, each by itself around the settings.
+GRID: dict[str, Sequence[int]] = {
+    "resolution": (64, 128, 256, 512, 1024),
+    "points": (1_000, 3_000, 10_000, 30_000, 100_000),
+    "photons": (1_000, 3_000, 10_000, 30_000, 100_000),
+    "width": (8, 16, 32, 64, 128),
+    "batch": (1, 2, 4, 8, 16),
+}
+_POWER = {"resolution": 2, "width": 2}  # at most, of the cost; of other factors 1
+_SAMPLES = 8  # that are rendered for the frames, at least
+_TRAINING_STEPS = 40
+_JOURNAL, _WORK = "points.jsonl", "samples"  # in the directory for work in progress
+_SAFE = 0.8  # of the free memory
+
+
+@dataclass(frozen=True)
+class Part:
+    """One measurement: of what, of which method, with which one setting changed."""
+
+    kind: str
+    method: str = ""
+    factor: str = ""
+    value: int = 0
+
+    @property
+    def key(self) -> str:
+        """Its name in the journal."""
+        return " ".join(str(word) for word in (self.kind, self.method, self.factor, self.value) if word)
+
+
+def bench(
+    out: str,
+    data: str = "demo",
+    scale: str = "demo",
+    methods: list[str] | None = None,
+    changed: Mapping[str, str] | None = None,
+    checkpoint: str | None = None,
+    device: str | None = None,
+    seconds: float = 20.0,
+    growth: list[str] | None = None,
+) -> Path:
+    """Measure, and write bench.json, bench.md and the figures to the directory `out`, which it returns.
+
+    What was measured before a kill counts when the same command is given again at the same commit.
+
+    Args:
+        data: a config of configs/data, by name or path.
+        scale: a config of configs/scale.
+        methods: configs of configs/model; None for all that are in no folder.
+        changed: settings, out of `SETTINGS`, in place of the configs'.
+        checkpoint: weights of the one method; else they are random.
+        device: cpu or cuda; None for cuda where there is one.
+        seconds: that a measurement may take.
+        growth: methods whose cost is measured over every factor of `GRID` that touches them.
+
+    Raises:
+        UserError: an unknown config, method, setting or device, or another method's checkpoint.
+    """
+    begun, start, load = origin(), time.time(), os.getloadavg()
+    run = _Bench(Path(out), data, scale, methods, changed or {}, checkpoint, device, seconds, growth or [])
+    done = run.resume(begun)
+    parts = run.parts()
+    with tqdm(total=len(parts), desc="measuring", unit="part", file=sys.stderr) as bar:
+        for part in parts:
+            bar.set_postfix_str(part.key)
+            if part.key not in done:
+                done[part.key] = run.measure(part, done)
+                run.note(part, done[part.key])
+            bar.update()
+    manifest = {
+        **begun,
+        **surroundings(run.device),
+        "clock": {"seconds": seconds, "least_frames": LEAST_FRAMES},
+        "load_average": {"before": load, "after": os.getloadavg()},
+        "wall_time_s": round(time.time() - start, 1),
+        "scenes": run.spec.scenes,
+        "experiment": run.spec.experiment,
+        "settings": run.settings,
+        "methods": run.methods,
+        "checkpoint": checkpoint,
+    }
+    rows = [{**part.__dict__, **done[part.key]} for part in parts]
+    write_bytes(run.out / BENCH, (json.dumps({"manifest": manifest, "parts": rows}, indent=1) + "\n").encode())
+    write_report(run.out)
+    shutil.rmtree(run.work)
+    print((run.out / "bench.md").read_text())
+    return run.out
+
+
+class _Bench:
+    """What `bench` was asked for, checked, and how each part is measured."""
+
+    def __init__(
+        self,
+        out: Path,
+        data: str,
+        scale: str,
+        methods: list[str] | None,
+        changed: Mapping[str, str],
+        checkpoint: str | None,
+        device: str | None,
+        seconds: float,
+        growth: list[str],
+    ) -> None:
+        self.out, self.work, self.seconds, self.checkpoint = out, out / ".bench", seconds, checkpoint
+        self.device = _device(device)
+        self.files = [str(find_config("data", data)), str(find_config("scale", scale))]
+        self.config = read_configs(self.files)
+        self.spec, _ = load_spec(self.files)
+        known = config_names("model")
+        self.methods = sorted(methods or [name for name in known if "/" not in name], key=order)
+        for option, names in (("--methods", self.methods), ("--growth", growth)):
+            for name in names:
+                if name not in known:
+                    raise UserError(f"{option}: no method {name!r} in configs/model; known are {', '.join(known)}")
+        if checkpoint and (len(self.methods) != 1 or growth):
+            raise UserError("--ckpt: is of one method; name it alone with --methods, and no --growth")
+        self.growth = growth
+        self.settings = self._settings(changed)
+        self.spec = self._sized(self.settings, 1)
+        self._renderer = cache(lambda scene: SampleRenderer(self.spec, scene))
+        if checkpoint:
+            self.settings |= {name: self._loaded(self.methods[0]).hparams[name] for name in _MODEL}
+
+    def _settings(self, changed: Mapping[str, str]) -> dict[str, int]:
+        defaults = {"width": 64, "depth": 3} | self.config.get("model", {}).get("init_args", {})
+        loading = {"batch_size": 32, "workers": 1} | self.config["data"]
+        settings = {name: getattr(self.spec, name) for name in _DATASET}
+        settings |= {name: defaults[name] for name in _MODEL} | {name: loading[name] for name in _DATA} | {"batch": 1}
+        for name, text in changed.items():
+            if name not in SETTINGS:
+                raise UserError(f"--set: {name}: unknown; known are {', '.join(SETTINGS)}")
+            least = {"resolution": 8, "workers": 0, "depth": 0}.get(name, 1)
+            if not text.isdecimal() or int(text) < least:
+                raise UserError(f"--set: {name}: must be a whole number of at least {least}, is {text!r}")
+            settings[name] = int(text)
+        return settings
+
+    def parts(self) -> list[Part]:
+        """All that is to be measured, in order: growth from small to large."""
+        trained = [name for name in self.methods if not untrained(name)]
+        parts = [Part("ceilings"), Part("generation"), Part("loading")]
+        parts += [Part("frame", name) for name in self.methods] + [Part("training", name) for name in trained]
+        for name in self.growth:
+            method = self.method(name, self.settings)
+            parts += [
+                Part("growth", name, factor, value)
+                for factor, values in GRID.items()
+                if _touches(factor, method)
+                for value in sorted({*values, self.settings[factor]})
+            ]
+        return parts
+
+    # --- what was measured before a kill ---
+
+    def resume(self, begun: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """The journal's results, by key, if it is of the same command and code; else it is begun."""
+        same = {name: begun[name] for name in ("command", "commit", "uncommitted_changes")}
+        journal, done = self.work / _JOURNAL, dict[str, dict[str, Any]]()
+        header, *lines = _read_lines(journal) or [None]
+        if header == same:
+            done = {line["part"]: line["result"] for line in lines}
+        if not done:
+            shutil.rmtree(self.work, ignore_errors=True)
+        text = [json.dumps(same), *(json.dumps({"part": key, "result": result}) for key, result in done.items())]
+        write_bytes(journal, "".join(f"{line}\n" for line in text).encode())
+        return done
+
+    def note(self, part: Part, result: dict[str, Any]) -> None:
+        """Append to the journal."""
+        with (self.work / _JOURNAL).open("a") as file:
+            file.write(json.dumps({"part": part.key, "result": result}) + "\n")
+
+    # --- what is measured on ---
+
+    def _sized(self, settings: Mapping[str, int], count: int) -> DatasetSpec:
+        """Of the settings' size, `count` training samples per scene and no others."""
+        sizes: dict[str, Any] = {name: settings[name] for name in _DATASET}
+        return replace(self.spec, val=0, test=0, train=count, shard_size=count, **sizes)
+
+    def data(self) -> LightTransportDataModule:
+        """Of the base's samples, as in training."""
+        dataset = self.dataset(self.settings, self._count())
+        batch_size, workers = (self.settings[name] for name in _DATA)
+        return LightTransportDataModule(dataset.spec, str(self.work / _WORK), batch_size, workers)
+
+    def renderer(self, spec: DatasetSpec, scene: int) -> SampleRenderer:
+        """Of a scene, which is loaded once for all sizes."""
+        render = self._renderer(scene)
+        render.spec = spec
+        return render
+
+    def dataset(self, settings: Mapping[str, int], count: int) -> LightTransportDataset:
+        """At least `count` rendered samples, in training's format; rendered before they are first asked for."""
+        spec = self._sized(settings, -(-count // len(self.spec.scenes)))
+        directory = spec.directory(self.work / _WORK)
+        for job in plan(spec, missing_files(directory, spec), 1):
+            fill(self.renderer(spec, job.scene), directory, job, lambda _: None)
+        write_manifest(directory, spec, choose_variant().name)
+        return LightTransportDataset(directory, spec, "train")
+
+    def frames(self, settings: Mapping[str, int], count: int) -> Frames:
+        """For the clock."""
+        dataset = self.dataset(settings, count)
+        return Frames(dataset, lambda scene: self.renderer(dataset.spec, scene))
+
+    def method(self, name: str, settings: Mapping[str, int]) -> Method:
+        """A method with random weights, or the checkpoint's."""
+        if method := untrained(name):
+            return method
+        if self.checkpoint:
+            return self._loaded(name)
+        file = find_config("model", name)
+        config = read_configs([self.files[0], str(file), self.files[1]])
+        torch.manual_seed(0)
+        arguments = {key: settings[key] for key in _MODEL} | {"num_scenes": len(self.spec.scenes)}
+        kind: Any = pydoc.locate(str(config["model"].get("class_path")))
+        try:
+            return kind(**{**config["model"].get("init_args", {}), **arguments, "num_points": settings["points"]})
+        except TypeError as error:
+            raise UserError(f"{file}: model: {error}") from None
+
+    def _loaded(self, name: str) -> RenderingModule:
+        try:
+            method = RenderingModule.load_from_checkpoint(str(self.checkpoint), map_location=self.device)
+        except OSError as error:
+            raise UserError(f"--ckpt: {self.checkpoint}: cannot be read: {error.strerror}") from None
+        except UserError:
+            raise
+        except Exception:  # whatever a damaged file makes the unpickler raise
+            raise UserError(f"--ckpt: {self.checkpoint}: not a checkpoint, or damaged; give another one") from None
+        wanted = read_configs([str(find_config("model", name))])["model"]["class_path"]
+        if method.class_path() != wanted:
+            raise UserError(f"--ckpt: {self.checkpoint}: is of {method.class_path()}, not {wanted}; give its --methods")
+        for key, here in (("num_points", self.settings["points"]), ("num_scenes", len(self.spec.scenes))):
+            if key in method.architecture and method.hparams[key] != here:
+                raise UserError(
+                    f"--ckpt: {self.checkpoint}: has {key}={method.hparams[key]}, these settings {here}: "
+                    "use its --data, --scale and --set points"
+                )
+        return method
+
+    # --- the measurements ---
+
+    def measure(self, part: Part, done: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+        """A part's result; `skipped` says why there is none. `done`: the results before it."""
+        if part.kind == "ceilings":
+            render = self.renderer(replace(self.spec, train=1), 0)
+            computing = ceilings.computing(self.device, self.seconds)
+            return {"computing": computing, "bare_s": ceilings.rendering(render, self.seconds)}
+        if part.kind in ("generation", "loading"):
+            return {"generation": self._generation, "loading": self._loading}[part.kind]()
+        if part.kind == "training":
+            return self._training(part.method, done[Part("frame", part.method).key])
+        if part.kind == "frame":
+            return self._frame(part.method)
+        return self._growth(part, done)
+
+    def _count(self) -> int:
+        return max(_SAMPLES, 2 * self.settings["batch_size"])
+
+    def _frame(self, name: str) -> dict[str, Any]:
+        clock = Clock(self.frames(self.settings, self._count()), self.device, self.settings["batch"])
+        method = self.method(name, self.settings)
+        if not isinstance(method, RenderingModule):
+            timed = clock.race({"": method}, self.seconds)[""]
+            return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
+        timed, slow = clock.race({"": method, "plain": plain(method)}, 2 * self.seconds).values()
+        ratios = [_network(s) / _network(t) for s, t in zip(slow, timed, strict=True)]
+        return {
+            **summary(timed),
+            **clock.size(method),
+            "timed_frames": len(timed),
+            "plain": summary(slow),
+            "speedup": dict(zip(("p5", "median", "p95"), np.percentile(ratios, (5, 50, 95)).tolist(), strict=True)),
+            "precision": _precision(clock, method),
+            "step_flops": clock.flops(method),
+        }
+
+    def _growth(self, part: Part, done: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+        settings = self.settings | {part.factor: part.value}
+        if settings == self.settings:  # as in the other factors' middles
+            for other in GRID:
+                if found := done.get(replace(part, factor=other, value=self.settings[other]).key):
+                    return found
+        smaller = [
+            (value, done[key])
+            for value in (*GRID[part.factor], self.settings[part.factor])
+            if value < part.value and (key := replace(part, value=value).key) in done
+        ]
+        if smaller:
+            value, last = max(smaller, key=lambda pair: pair[0])
+            if "skipped" in last:
+                return {"skipped": f"so was {part.factor} {value:,}"}
+            factor = (part.value / value) ** _POWER.get(part.factor, 1)
+            took, free = factor * last["time_per_frame_s"], _free_memory(self.device)
+            if took > self.seconds:
+                return {"skipped": f"a frame is predicted to take {took:.1f} s, more than {self.seconds:g} s"}
+            if (need := factor * last.get("peak_memory_bytes", 0)) > _SAFE * free:
+                return {"skipped": f"predicted to need {need / 2**30:.1f} GiB, {free / 2**30:.1f} are free"}
+        count = LEAST_FRAMES if part.factor in _DATASET and settings != self.settings else self._count()
+        clock = Clock(self.frames(settings, count), self.device, settings["batch"])
+        method = self.method(part.method, settings)
+        timed = clock.race({"": method}, self.seconds)[""]
+        return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
+
+    def _training(self, name: str, frame: Mapping[str, Any]) -> dict[str, Any]:
+        """Images per second of the trainer's own loop, and the share of a step that it waits for data."""
+        size = self.settings["batch_size"]
+        step = 3 * size * _network(frame, "_s") / self.settings["batch"]
+        if 2 * step > self.seconds:
+            why = f"2 steps of batch {size} are predicted to take {2 * step:.0f} s, more than {self.seconds:g} s"
+            return {"skipped": why}
+        data, method = self.data(), self.method(name, self.settings)
+        assert isinstance(method, RenderingModule)
+        steps = _Steps(self.seconds, self.device)
+        precision = {**trainer_defaults(), **self.config.get("trainer", {})}.get("precision")
+        quiet()
+        trainer = L.Trainer(
+            max_epochs=-1, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1, callbacks=[steps],
+            logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+            use_distributed_sampler=False, limit_val_batches=0, precision=precision,
+        )  # fmt: skip
+        trainer.fit(method.train(), datamodule=data)
+        whole = [a + b for a, b in zip(steps.waited, steps.computed, strict=True)]
+        return {
+            "images_per_second": size / statistics.median(whole),
+            "step_s": statistics.median(whole),
+            "step_p95_s": float(np.percentile(whole, 95)),
+            "waiting_share": sum(steps.waited) / sum(whole),
+            "timed_steps": len(whole),
+        }
+
+    def _loading(self) -> dict[str, Any]:
+        """Samples per second of the DataLoader alone, with all fields and their CRCs, from files read before."""
+        data = self.data()
+        data.setup("fit")
+        loader = data.train_dataloader()
+        rates: list[float] = []
+        begin = time.perf_counter()
+        while len(rates) < 2 or time.perf_counter() - begin < self.seconds / 2:
+            start = time.perf_counter()
+            samples = sum(len(batch["scene"]) for batch in loader)
+            rates.append(samples / (time.perf_counter() - start))
+        rate = statistics.median(rates[1:])
+        return {"samples_per_second": rate, "bytes_per_second": rate * data.spec.nbytes("train")}
+
+    def _generation(self) -> dict[str, Any]:
+        """Samples per second of one process, by kind, and the ratio to the bare loop of the same rays in turns."""
+        spec = replace(self.spec, train=_SAMPLES)
+        render = self.renderer(spec, 0)
+        bare = Bare(render, frozen=True)
+        views = [(render.place("train", k), render.scene.state) for k in range(_SAMPLES)]
+        stages: list[dict[str, float]] = []
+        pairs: list[tuple[float, float]] = []
+        begin = time.perf_counter()
+        while len(pairs) < 3 or (time.perf_counter() - begin < self.seconds and len(pairs) < _TRAINING_STEPS):
+            k = len(pairs) % _SAMPLES
+            sample, ours = _timed(partial(render.sample, "train", k))
+            camera, state = views[k - 1]  # not the state that the scene is in
+            _, theirs = _timed(partial(bare.sample, state, camera, "train", k))
+            pairs.append((ours, theirs))
+            stages.append(laps(render, k, partial(write_shard, self.work / "shard", [sample])))
+        medians = {name: statistics.median(s[name] for s in stages[1:]) for name in stages[0]}
+        medians["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
+        whole = sum(medians.values())
+        return {
+            "stages_s": medians,
+            "train_per_second": 1 / (whole - medians["reference"]),
+            "evaluated_per_second": 1 / whole,
+            "of_bare_loop": statistics.median(b / a for a, b in pairs[1:]),
+        }
+
+
+class _Steps(L.Callback):
+    """Seconds of a training's steps, by what goes on: waiting for the batch, computing."""
+
+    def __init__(self, seconds: float, device: torch.device) -> None:
+        self.waited, self.computed = list[float](), list[float]()
+        self.seconds, self.device, self.end = seconds, device, 0.0
+        self.begin = self.start = time.perf_counter()
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        self.start = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        now = time.perf_counter()
+        if self.end:  # the first step warms up
+            self.waited.append(self.start - self.end)
+            self.computed.append(now - self.start)
+        self.end = now
+        taken = len(self.waited)
+        trainer.should_stop = taken >= _TRAINING_STEPS or (taken > 0 and now - self.begin > self.seconds)
+
+
+def _read_lines(journal: Path) -> list[Any]:
+    """The journal's lines; a last one that a kill tore is passed over."""
+    lines = []
+    for line in journal.read_text().splitlines() if journal.exists() else []:
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            break
+    return lines
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    start = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - start
+
+
+def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:
+    return sum(seconds.get(f"{name}{suffix}", 0.0) for name in NETWORK_STAGES)
+
+
+def _precision(clock: Clock, method: RenderingModule) -> str:
+    """In which the first convolution gives its result."""
+    found: list[torch.dtype] = []
+    hook = method.unet.conv_in.register_forward_hook(lambda _, __, output: found.append(output.dtype))
+    clock.flops(method)
+    hook.remove()
+    return str(found[0]).removeprefix("torch.")
+
+
+def _touches(factor: str, method: Method) -> bool:
+    if factor in ("points", "photons"):
+        return any(name.startswith(factor[:-1]) for name in method.inputs)
+    return factor != "width" or isinstance(method, RenderingModule)
+
+
+def _device(name: str | None) -> torch.device:
+    if name not in (None, "cpu", "cuda"):
+        raise UserError(f"--device: must be cpu or cuda, is {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("--device: cuda: there is none here; use --device cpu")
+    return torch.device(name) if name else default_device()
+
+
+def _free_memory(device: torch.device) -> float:
+    """Bytes that a measurement may take."""
+    if device.type == "cuda":
+        return float(torch.cuda.mem_get_info(device)[0])
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        return 1024 * float(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError):
+        return math.inf

@@ -1,0 +1,94 @@
+"""What this machine can do at best: large matrix products and convolutions, memory copies, Mitsuba's bare calls."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from nlt.data.render import SampleRenderer
+from nlt.evaluation.bare import Bare
+
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_ENOUGH = 0.05  # seconds of a call, above which overheads do not count
+_LARGEST = {"matmul": 8192, "convolution": 64}
+_COPIED = 1 << 28  # bytes
+
+
+def computing(device: torch.device, seconds: float) -> dict[str, float]:
+    """Operations and bytes (read and written) per second, the best of repeated calls of `seconds` / 6 each.
+
+    The convolution has 3x3 taps, 128 to 128 channels, images of 128x128; the better of both layouts counts.
+    """
+    share = seconds / 6
+    ceilings: dict[str, float] = {}
+    for name, dtype in _DTYPES.items():
+        ceilings[f"matmul_{name}"] = _grown("matmul", partial(_matmul, device, dtype), device, share)
+        ceilings[f"convolution_{name}"] = max(
+            _grown("convolution", partial(_convolution, device, dtype, layout), device, share / 2)
+            for layout in (torch.contiguous_format, torch.channels_last)
+        )
+    source = torch.zeros(_COPIED // 4, device=device)
+    target = torch.empty_like(source)
+    ceilings["copy"] = 2 * _COPIED / best(lambda: target.copy_(source), device, share)
+    return ceilings
+
+
+def rendering(render: SampleRenderer, seconds: float) -> dict[str, float]:
+    """Seconds, at the spec's size, of one bare `mi.render` at 1 spp, of one with the G-buffer, of the photons alone."""
+    bare = Bare(render, frozen=True)
+    camera = render.place("train", 0)
+    bare.sample(render.scene.state, camera, "train", 0)
+    cpu = torch.device("cpu")  # results are copied to numpy, so nothing is left running
+    calls: dict[str, Callable[[], object]] = {
+        "path_tracing": lambda: bare.render(bare.path, 1, 0),
+        "gbuffer": lambda: bare.render(bare.aov, 1, 0),
+        "photons": lambda: bare.photons(0),
+    }
+    return {name: best(call, cpu, seconds / len(calls)) for name, call in calls.items()}
+
+
+def best(call: Callable[[], object], device: torch.device, seconds: float) -> float:
+    """The least seconds that a call took, of several, one at least after one to warm up."""
+    taken: list[float] = []
+    begin = time.perf_counter()
+    while len(taken) < 2 or time.perf_counter() - begin < seconds:
+        start = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        taken.append(time.perf_counter() - start)
+    return min(taken[1:])
+
+
+def _grown(
+    kind: str, make: Callable[[int], tuple[Callable[[], object], float]], device: torch.device, s: float
+) -> float:
+    """Operations per second at the size from which on a call takes long enough."""
+    size = {"matmul": 512, "convolution": 1}[kind]
+    while True:
+        call, operations = make(size)
+        if size >= _LARGEST[kind] or best(call, device, 0) > _ENOUGH:
+            return operations / best(call, device, s)
+        size *= 2
+
+
+@torch.inference_mode()
+def _matmul(device: torch.device, dtype: torch.dtype, size: int) -> tuple[Callable[[], object], float]:
+    a = torch.ones(size, size, device=device, dtype=dtype)
+    return lambda: a @ a, 2.0 * size**3
+
+
+@torch.inference_mode()
+def _convolution(
+    device: torch.device, dtype: torch.dtype, layout: torch.memory_format, batch: int
+) -> tuple[Callable[[], object], float]:
+    channels, side = 128, 128
+    image = torch.ones(batch, channels, side, side, device=device, dtype=dtype).to(memory_format=layout)
+    kernel = torch.ones(channels, channels, 3, 3, device=device, dtype=dtype).to(memory_format=layout)
+    operations = 2.0 * np.prod(kernel.shape) * batch * side**2
+    return lambda: F.conv2d(image, kernel, padding=1), float(operations)

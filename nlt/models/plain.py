@@ -1,0 +1,109 @@
+"""The plain reference path: a method's own weights by the straightforward reading of the paper, to measure speed-ups.
+
+Eager, float32 throughout, contiguous NCHW, one pass over everything, nothing kept from frame to frame. Slow on purpose:
+whatever makes the usual path fast does not belong here.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlt.metrics.display import expose
+from nlt.models.module import Batch, RenderingModule
+
+
+def plain(method: RenderingModule) -> RenderingModule:
+    """A copy of a method that makes the same image, up to rounding, by the plain path."""
+    twin = copy.deepcopy(method).float().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    twin.__class__ = type(f"Plain{type(method).__name__}", (_Plain, type(method)), {})
+    return twin
+
+
+class _Plain(RenderingModule):
+    """What a plain method does in place of its own."""
+
+    def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
+        camera = (batch["camera_matrix"], batch["world_to_view"])
+        return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
+
+    def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
+        return expose(self.unet(features.contiguous()), 1 / batch["exposure"])
+
+    def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
+        return {name: _in_float32(step) for name, step in super().steps().items()}
+
+
+def _in_float32(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], Any]:
+    def run(batch: Batch, result: Any) -> Any:
+        with _float32(batch["exposure"].device.type):
+            return step(batch, result)
+
+    return run
+
+
+@contextmanager
+def _float32(device: str) -> Iterator[None]:
+    """No autocast, no TF32."""
+    precision = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        with torch.autocast(device, enabled=False), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(precision)
+
+
+def project(
+    features: Tensor,
+    positions: Tensor,
+    valid: Tensor,
+    camera_matrix: Tensor,
+    world_to_view: Tensor,
+    depth: Tensor,
+    normal: Tensor,
+    epsilon: float = 1e-3,
+) -> Tensor:
+    """Eq. (1), every point in full: arguments and result as of `nlt.models.projection.project`."""
+    height, width = depth.shape[-2:]
+    rotation, translation = world_to_view[:, :3, :3], world_to_view[:, None, :3, 3]
+    view = positions @ rotation.mT + translation
+    homogeneous = view @ camera_matrix.mT
+    z = view[..., 2]
+    in_front = z > 0
+    x, y = (homogeneous[..., :2] / torch.where(in_front, z, 1)[..., None]).unbind(-1)
+    seen = valid & in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y = torch.where(seen, x, 0), torch.where(seen, y, 0)
+
+    # How much of the four nearest pixels, by bilinear weight, shows a surface whose plane lies before the point.
+    to_ray = torch.linalg.inv(camera_matrix).mT
+    ray = torch.stack([x, y, torch.ones_like(x)], -1) @ to_ray  # of depth 1
+    occluded = torch.zeros_like(x)
+    left, top = (x - 0.5).floor(), (y - 0.5).floor()
+    for column, row in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
+        weight = (1 - (x - 0.5 - column).abs()) * (1 - (y - 0.5 - row).abs())
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+        centre = torch.stack([column + 0.5, row + 0.5, torch.ones_like(x)], -1) @ to_ray
+        at = (row * width + column).long()
+        surface = _gather(depth, at)
+        n = _gather(normal.to(depth.dtype), at) @ rotation.mT
+        met = (n * centre * surface).sum(-1) / (n * ray).sum(-1)  # depth of the plane on the point's ray
+        occluded += weight * ((surface[..., 0] > 0) & (met > 0) & (z > (1 + epsilon) * met))
+    seen = seen & (occluded < 0.5)
+
+    pixel = (y.long() * width + x.long())[:, None]
+    summand = torch.where(seen[..., None], features, 0).mT
+    shape = (len(features), features.shape[-1], height * width)
+    total = features.new_zeros(shape).scatter_add(2, pixel.expand_as(summand), summand)
+    count = features.new_zeros(shape[0], 1, shape[2]).scatter_add(2, pixel, seen[:, None].to(features.dtype))
+    return (total / count.clamp(min=1)).view(*shape[:2], height, width)
+
+
+def _gather(image: Tensor, pixels: Tensor) -> Tensor:
+    """Of an image (B, C, H, W) at flat pixels (B, N): (B, N, C)."""
+    return image.flatten(2).gather(2, pixels[:, None].expand(-1, image.shape[1], -1)).mT
