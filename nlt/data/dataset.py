@@ -71,16 +71,23 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         if "present" not in stored:
             return {}
         points = self._points[scene]
-        # Row -1, for what never moves, stays where it is.
-        translation = np.concatenate([stored["translation"], np.zeros((1, 3), np.float32)])
-        present = np.concatenate([stored["present"], [True]])
+        position, visible = place_points(points, stored["translation"], stored["present"])
         return {
-            "point_position": torch.from_numpy(points["position"] + translation[points["object"]]),
-            "point_visible": torch.from_numpy(present[points["object"]]),
+            "point_position": torch.from_numpy(position),
+            "point_visible": torch.from_numpy(visible),
             "point_material": torch.from_numpy(points["material"].astype(np.int64)),
             "point_albedo": torch.from_numpy(points["albedo"]),
             "point_emission": torch.from_numpy(points["emission"]),
         }
+
+
+def place_points(
+    points: dict[str, np.ndarray], translation: np.ndarray, present: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) and visibility (N,) of a scene's points in a state: translation (M, 3) and present (M,)."""
+    # Row -1, for what never moves, stays where it is.
+    translation, present = np.concatenate([translation, np.zeros((1, 3), np.float32)]), np.append(present, True)
+    return points["position"] + translation[points["object"]], present[points["object"]]
 
 
 def _tensor(array: np.ndarray) -> Tensor:

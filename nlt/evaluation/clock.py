@@ -67,7 +67,7 @@ class Clock:
         return timed
 
     def _frame(self, method: Method, indices: Sequence[int]) -> dict[str, float]:
-        batch, spec = self._batch(indices), self.dataset.spec
+        batch, spec = method.thin(self._batch(indices)), self.dataset.spec
         seconds: dict[str, float] = {}
         mask = method.mask(batch, spec.resolution, spec.resolution)
         traced = []
@@ -76,7 +76,7 @@ class Clock:
             if "gbuffer" in method.stages:
                 self._lap(seconds, "gbuffer", partial(renderer.gbuffer, camera))
             if "photons" in method.stages:
-                self._lap(seconds, "photons", partial(renderer.photons, spec.photons, index))
+                self._lap(seconds, "photons", partial(renderer.photons, method.num_photons or spec.photons, index))
             if "path_tracing" in method.stages:
                 pixels = None if method.pixel_fraction == 1 else mask[row, 0].flatten().nonzero()[:, 0].cpu().numpy()
                 spp = method.spp or spec.input_spp
@@ -142,7 +142,7 @@ class Clock:
         """A batch with what the method reads and no more."""
         whole = self._batch([k % len(self.dataset) for k in range(self.batch)])
         batch = {name: value for name, value in whole.items() if name in (*method.inputs, "exposure", "scene")}
-        return batch | {"index": torch.zeros_like(batch["scene"])}
+        return method.thin(batch | {"index": torch.zeros_like(batch["scene"])})
 
 
 def summary(laps: list[dict[str, float]]) -> dict[str, Any]:

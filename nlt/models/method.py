@@ -40,6 +40,15 @@ class Method(nn.Module):
         """Samples per pixel of the stage "path_tracing"; None for those of the dataset's `noisy_input`."""
         return None
 
+    @property
+    def num_photons(self) -> int | None:
+        """Photons of the stage "photons"; None for as many as the dataset has."""
+        return None
+
+    def thin(self, batch: Batch) -> Batch:
+        """What the method takes of a batch: all of it, unless overridden."""
+        return batch
+
     def mask(self, batch: Batch, height: int, width: int) -> Tensor:
         """The pixels (B, 1, height, width) that the stage "path_tracing" traces; all, unless overridden."""
         return torch.ones(len(batch["scene"]), 1, height, width, dtype=torch.bool, device=batch["scene"].device)

@@ -55,6 +55,8 @@ class RenderingModule(Method, L.LightningModule):
         lr_decay: float = 0.99,
         num_scenes: int = 1,
         num_points: int = 1,
+        max_points: int | None = None,
+        max_photons: int | None = None,
         seed: int = 0,
     ) -> None:
         """Defaults are the paper's.
@@ -67,13 +69,19 @@ class RenderingModule(Method, L.LightningModule):
             lr_decay: factor to the learning rate after each epoch.
             num_scenes: scenes in the dataset; linked from the data.
             num_points: points per scene; linked from the data.
+            max_points: use so many of them; None for all.
+            max_photons: use so many photons of a sample, each with more flux; None for all.
             seed: of what a method draws at random in training.
         """
         super().__init__()
         for name, value, least in (("width", width, 1), ("depth", depth, 0)):
             if value < least:
                 raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
+        for name, most in (("max_points", max_points), ("max_photons", max_photons)):
+            if most is not None and most < 1:
+                raise UserError(f"model.init_args.{name}: must be at least 1, is {most}")
         self.save_hyperparameters()
+        self.hparams["num_points"] = min(num_points, max_points or num_points)  # the embeddings that it has
         self.loss = getattr(losses, loss)
         # channels_last: the convolutions' fastest layout
         self.unet = UNet(self.feature_channels, width, depth).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -112,10 +120,27 @@ class RenderingModule(Method, L.LightningModule):
         # Out of what layout and, under autocast, precision the convolutions ran in.
         return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
 
+    @property
+    def num_photons(self) -> int | None:
+        return self.hparams["max_photons"]
+
+    def thin(self, batch: Batch) -> Batch:
+        """The batch with `max_points` points and `max_photons` photons at most; the photons' flux sums to the same."""
+        points, photons = self.hparams["max_points"], self.hparams["max_photons"]
+        if points:  # in the order in which they were drawn: any of them are a uniform sample
+            batch = {k: v[:, :points] if k.startswith("point_") else v for k, v in batch.items()}
+        total = batch["photon_flux"].shape[1] if "photon_flux" in batch else 0
+        if photons and total > photons:  # they lie by emitter: of each its share
+            chosen = ((torch.arange(photons, device=batch["photon_flux"].device) + 0.5) * (total / photons)).long()
+            batch = {k: v[:, chosen] if k.startswith("photon_") else v for k, v in batch.items()}
+            batch["photon_flux"] = batch["photon_flux"] * (total / photons)
+        return batch
+
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         """Transport, projection, synthesis."""
-        transport = lambda batch, _: self.transport(batch)
-        return {"transport": transport, "projection": self.features, "synthesis": self.synthesize}
+        transport = lambda batch, _: self.transport(self.thin(batch))
+        features = lambda batch, transported: self.features(self.thin(batch), transported)
+        return {"transport": transport, "projection": features, "synthesis": self.synthesize}
 
     # --- training and evaluation ---
 

@@ -1,0 +1,179 @@
+"""What varies in a scene and an experiment, and so what a model of it can do without; nothing is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from nlt.data.dataset import place_points
+from nlt.data.engines import Process
+from nlt.data.render import SampleRenderer
+from nlt.data.sample import MATERIALS
+from nlt.data.spec import DatasetSpec
+from nlt.models.module import PROJECTION
+from nlt.models.projection import visible_pixels
+from nlt.rendering.variant import choose_variant
+from nlt.scenes.assembly import Scene
+
+_VIEWS = 16
+_MOST = 1 << 16  # points and photons that are tried
+_COUNTS = tuple(1 << k for k in range(7, 17))
+_GAIN = 0.05  # of the pixels: twice as many points that cover less than this in addition are not worth it
+_FIELDS = ("depth", "normal", "camera_matrix", "world_to_view", "translation", "present", "photon_hit", "photon_valid")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a scene holds, in an experiment, that decides what a model of it needs.
+
+    Attributes:
+        moving: objects that states move or remove; `moving_lights`: those of them that emit.
+        materials: share of each of `MATERIALS` in the surface that may be seen, where it is above zero.
+        points: share of the pixels that see a surface that hold at least one of N points, by N; `photons`: of P.
+    """
+
+    scene: str
+    moving: tuple[str, ...]
+    moving_lights: tuple[str, ...]
+    materials: dict[str, float]
+    points: dict[int, float]
+    photons: dict[int, float]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """One answer: what a model needs of `subject`, and why."""
+
+    subject: str
+    verdict: str
+    reason: str
+
+
+def measure_facts(spec: DatasetSpec, views: int = _VIEWS) -> list[Facts]:
+    """Of every scene of a dataset in its experiment, at its resolution; a process per scene.
+
+    Raises:
+        UserError: a scene does not load.
+    """
+    choose_variant()  # once; the processes inherit it
+    spec = dataclasses.replace(spec, points=_MOST, photons=_MOST, train=0, val=0, test=views)
+    return [Process(_facts, spec, scene).result() for scene in range(len(spec.scenes))]
+
+
+def _facts(spec: DatasetSpec, scene: int) -> Facts:
+    torch.set_num_threads(1)  # in a process of its own: on a busy machine, threads that wait for each other take longer
+    render = SampleRenderer(spec, scene)
+    moving, lights = what_moves(render.scene)
+    points = render.points()
+    curves: dict[str, list[dict[int, float]]] = {"points": [], "photons": []}
+    for view in range(spec.test):
+        sample = render.sample("test", view, only=_FIELDS)
+        camera: dict[str, Any] = {name: torch.from_numpy(sample[name][None].astype(np.float32)) for name in PROJECTION}
+        clouds = {
+            "points": place_points(points, sample["translation"], sample["present"]),
+            "photons": (sample["photon_hit"], sample["photon_valid"]),
+        }
+        for name, (position, valid) in clouds.items():
+            pixels = visible_pixels(torch.from_numpy(position)[None], torch.from_numpy(valid)[None], **camera)
+            curves[name].append(occupancy(pixels[0].numpy(), sample["depth"].ravel() > 0, len(position)))
+    means = {name: {n: float(np.mean([c[n] for c in found])) for n in _COUNTS} for name, found in curves.items()}
+    return Facts(spec.descriptions[scene].name, moving, lights, shares_of_materials(points), **means)
+
+
+def shares_of_materials(points: dict[str, np.ndarray]) -> dict[str, float]:
+    """Share of the points by material, where it is above zero."""
+    shares = np.bincount(points["material"], minlength=len(MATERIALS)) / len(points["material"])
+    return {name: float(share) for name, share in zip(MATERIALS, shares, strict=True) if share > 0}
+
+
+def what_moves(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the objects that states move or remove; of those among them that emit light."""
+    moving = [m for m in scene.movables if m.removable or np.ptp(m.box, axis=0).any()]
+    emits = lambda m: any(scene.shapes[shape].emitter is not None for shape in m.shapes)
+    return tuple(m.name for m in moving), tuple(m.name for m in moving if emits(m))
+
+
+def occupancy(pixels: np.ndarray, surface: np.ndarray, total: int) -> dict[int, float]:
+    """Share of the pixels in `surface` (H*W,) bool that hold one of n points at least, by n.
+
+    `pixels` (total,) as of `visible_pixels`. By rarefaction: with each of the total kept at probability n / total,
+    the expected share.
+    """
+    held = np.bincount(pixels, minlength=len(surface) + 1)[:-1][surface]
+    return {n: float(np.mean(1 - (1 - min(n / total, 1)) ** held)) if len(held) else 0.0 for n in _COUNTS}
+
+
+def enough(curve: dict[int, float]) -> int:
+    """The count from which on doubling covers less than 5 % of the pixels more; the most tried if there is none."""
+    counts = sorted(curve)
+    for n, half in zip(reversed(counts), reversed(counts[:-1]), strict=False):
+        if curve[n] - curve[half] >= _GAIN:
+            return n
+    return counts[0]
+
+
+def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
+    """What a model of a dataset needs: what any of its scenes needs."""
+    return [
+        _transport(facts),
+        _view_direction(facts),
+        _count("points", spec.points, [fact.points for fact in facts]),
+        _count("photons", spec.photons, [fact.photons for fact in facts]),
+    ]
+
+
+def _transport(facts: list[Facts]) -> Advice:
+    lights = [name for fact in facts for name in fact.moving_lights]
+    moving = [name for fact in facts for name in fact.moving]
+    if lights:
+        reason = f"lights move or are removed: {_some(lights)}; photons say where light arrives in each state"
+        return Advice("light transport", "photons: nlt_photons, photon_splat", reason)
+    if moving:
+        reason = f"objects move or are removed: {_some(moving)}; no light does, so where it arrives is learned"
+        return Advice("light transport", "points: nlt", reason)
+    reason = "nothing moves: what leaves a point is always the same, and a learned feature of the point holds it"
+    return Advice("light transport", "none: feature_projection, ablation", reason)
+
+
+def _view_direction(facts: list[Facts]) -> Advice:
+    shares = {name: float(np.mean([fact.materials.get(name, 0) for fact in facts])) for name in MATERIALS}
+    specular = {name: share for name, share in shares.items() if share and name != "diffuse"}
+    if not specular:
+        reason = "every surface is diffuse: it looks the same from everywhere"
+        return Advice("view direction", "not needed: ablation without ray_direction", reason)
+    listed = ", ".join(f"{name} {share:.2%}" for name, share in specular.items())
+    return Advice("view direction", "needed", f"of the surface that may be seen, {listed}")
+
+
+def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
+    best = max(enough(curve) for curve in curves)
+    share = lambda n: float(np.mean([np.interp(np.log(n), np.log(list(c)), list(c.values())) for c in curves]))
+    verdict = f"{best:,} of {count:,}" if best < count else f"all {count:,}"
+    reason = (
+        f"{share(count):.0%} of the pixels with a surface hold one of {count:,}, {share(best):.0%} one of {best:,}; "
+        f"beyond those, twice as many would add less than {_GAIN:.0%}"
+    )
+    if best == max(_COUNTS):
+        reason = reason.partition(";")[0] + "; more were not tried"
+    return Advice(what, verdict, reason)
+
+
+def _some(names: list[str]) -> str:
+    names = list(dict.fromkeys(names))
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def table(advice: list[Advice], facts: list[Facts]) -> str:
+    """Markdown: the answers with their reasons, and the coverage behind them."""
+    lines = ["# What varies", "", "| | needs | because |", "|---|---|---|"]
+    lines += [f"| {each.subject} | {each.verdict} | {each.reason} |" for each in advice]
+    lines += ["", "Share of the pixels with a surface that hold at least one of so many, mean over random views:", ""]
+    lines += [f"| | {' | '.join(f'{n:,}' for n in _COUNTS)} |", "|---|" + "---:|" * len(_COUNTS)]
+    for fact in facts:
+        for name, curve in (("points", fact.points), ("photons", fact.photons)):
+            lines.append(f"| {fact.scene}: {name} | " + " | ".join(f"{curve[n]:.0%}" for n in _COUNTS) + " |")
+    return "\n".join(lines) + "\n"

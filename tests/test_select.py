@@ -1,0 +1,211 @@
+"""`nlt select`: what varies against facts found independently; the statistics of the choice; the search end to end."""
+
+import itertools
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy import stats
+
+from nlt.baselines.feature_projection import FeatureProjection
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import DatasetSpec
+from nlt.evaluation import advice
+from nlt.evaluation.choice import choose, paired_difference, ranked, within
+from nlt.models.nlt import NeuralLightTransport
+from nlt.paths import CONFIGS
+from nlt.scenes.assembly import Scene
+from nlt.scenes.builtin import BUILTINS, mitsuba_scene
+from nlt.scenes.description import EXPERIMENTS, load_description
+from nlt.scenes.pointcloud import sample_points
+
+# ---- what varies ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=sorted(BUILTINS))
+def built(request):
+    """(name, its yaml, {shape: BSDF flags}, shapes that emit), by Mitsuba alone; in scalar_rgb, which loads faster."""
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    description = yaml.safe_load((CONFIGS / "scenes" / f"{request.param}.yaml").read_text())
+    shapes = mitsuba_scene(request.param).shapes()
+    flags = {shape.id(): int(shape.bsdf().flags()) for shape in shapes}
+    yield request.param, description, flags, {shape.id() for shape in shapes if shape.is_emitter()}
+    if before is not None:
+        mi.set_variant(before)
+
+
+def test_what_varies(built):
+    """What moves, what of it emits, and what is specular, as Mitsuba's own flags say."""
+    name, content, flags, emitting = built
+    description = load_description(name)
+    scenes = {experiment: Scene(description, experiment) for experiment in EXPERIMENTS[1:]}
+    # Nothing is movable; the rest is that of fixed lights.
+    scenes["static"] = SimpleNamespace(movables=description.movables("static"), shapes=scenes["fixed_lights"].shapes)
+    for experiment, scene in scenes.items():
+        moving, lights = advice.what_moves(scene)
+        objects = content["objects"] if experiment != "static" else {}
+        extra = {"moving_light"} if experiment == "moving_lights" else set()
+        assert set(moving) == set(objects) | extra, experiment
+        mine = {key for key, value in objects.items() if emitting & set(value["shapes"])}
+        assert set(lights) == (extra or mine), experiment
+        verdict = advice.advise(DatasetSpec([name], experiment), [facts(moving, lights)])[0].verdict
+        assert verdict.partition(":")[0] == ("photons" if lights else "points" if moving else "none")
+    points = sample_points(scenes["fixed_lights"], 200, 0)
+    shares = advice.shares_of_materials(points)
+    lobes = [mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyTransmission]
+    lobes += [mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission]
+    specular = np.array([any(value & int(lobe) for lobe in lobes) for value in flags.values()])
+    assert np.isclose(1 - shares.get("diffuse", 0), specular[points["shape"]].mean())
+    assert np.isclose(sum(shares.values()), 1)
+    assert advice.advise(DatasetSpec([name]), [facts(materials=shares)])[1].verdict == "needed"
+
+
+def facts(moving=(), lights=(), materials=None, points=None, photons=None):
+    flat = dict.fromkeys(advice._COUNTS, 1.0)
+    return advice.Facts("room", tuple(moving), tuple(lights), materials or {"diffuse": 1.0}, points or flat,
+                        photons or flat)  # fmt: skip
+
+
+def test_advice_of_several_scenes():
+    """A dataset needs what any of its scenes needs."""
+    spec = DatasetSpec(["egg", "kitchen"], points=4096, photons=300)
+    some = [facts(["cup"]), facts(["lamp", "cup"], ["lamp"], {"diffuse": 0.5, "mirror": 0.5})]
+    transport, direction, *_ = advice.advise(spec, some)
+    assert transport.verdict.startswith("photons") and "lamp" in transport.reason and "cup" not in transport.reason
+    assert direction.verdict == "needed" and "mirror 25" in direction.reason
+    assert advice.advise(spec, some[:1])[1].verdict.startswith("not needed")
+    text = advice.table(advice.advise(spec, some), some)
+    assert all(each.reason in text for each in advice.advise(spec, some))
+
+
+def test_occupancy():
+    """Rarefaction against drawing subsets."""
+    rng = np.random.default_rng(0)
+    pixels = rng.choice(33, 4096, p=rng.dirichlet(np.full(33, 0.3)))  # the last is for what is not seen
+    surface = np.arange(32) % 4 > 0
+    curve = advice.occupancy(pixels, surface, 4096)
+    for n in (128, 512, 4096):
+        drawn = [rng.choice(pixels, n, replace=False) for _ in range(400)]
+        shares = [np.isin(np.flatnonzero(surface), each).mean() for each in drawn]
+        assert np.isclose(curve[n], np.mean(shares), atol=0.01)
+    assert advice.occupancy(pixels, np.zeros(32, bool), 4096)[128] == 0
+
+
+def test_enough():
+    """Where a Poisson law saturates, found by search."""
+    for rate in (2e-4, 1e-3, 8e-3):
+        curve = {n: 1 - np.exp(-rate * n) for n in advice._COUNTS}
+        gains = [(n, curve[n] - curve[n // 2]) for n in advice._COUNTS[1:]]
+        assert advice.enough(curve) == max(n for n, gain in gains if gain >= 0.05)
+        points, photons = advice.advise(DatasetSpec(["egg"], points=1 << 20, photons=64), [facts(points=curve)])[2:]
+        assert points.verdict == f"{advice.enough(curve):,} of {1 << 20:,}"
+        assert photons.verdict == "all 64"
+    assert advice.enough(dict.fromkeys(advice._COUNTS, 0.9)) == min(advice._COUNTS)
+
+
+def test_coverage_is_that_of_the_area_seen(variant):
+    """The measured occupancy of points is Poisson's for the area that each pixel sees."""
+    spec = DatasetSpec(["egg"], "static", resolution=16, points=1 << 14, photons=64, train=0, val=0, test=3)
+    found = advice._facts(spec, 0)
+    render, shares = SampleRenderer(spec, 0), []
+    area = sum(s.face_areas.sum() for s in render.scene.shapes.values()) * float(render.points()["area_share"])
+    for view in range(3):
+        sample = render.sample("test", view, only=("depth", "normal", "camera_matrix", "world_to_view"))
+        # A pixel's corners on the plane through its centre: half the cross product of the diagonals.
+        inverse, rotation = np.linalg.inv(sample["camera_matrix"].astype(float)), sample["world_to_view"][:3, :3]
+        row, column = (x.ravel() for x in np.mgrid[:16, :16])
+        rays = lambda di, dj, c=column, r=row, m=inverse: m @ np.stack([c + di, r + dj, np.ones_like(c)])
+        normal = rotation @ sample["normal"].reshape(3, -1).astype(float)
+        reach = (normal * rays(0.5, 0.5) * sample["depth"].ravel()).sum(0)
+        corner = [rays(*o) * reach / (normal * rays(*o)).sum(0) for o in ((0, 0), (1, 1), (1, 0), (0, 1))]
+        seen = np.linalg.norm(np.cross((corner[1] - corner[0]).T, (corner[3] - corner[2]).T), axis=1) / 2
+        shares.append(seen[sample["depth"].ravel() > 0] / area)
+    for n in (128, 512, 2048):
+        assert abs(found.points[n] - np.mean([np.mean(1 - np.exp(-n * share)) for share in shares])) < 0.03
+
+
+# ---- fewer points and photons ---------------------------------------------------------------------------
+
+
+def test_thin():
+    """Flux sums to the same in expectation, and of every emitter come as many photons as are its share."""
+    torch.manual_seed(0)
+    kinds = torch.repeat_interleave(torch.arange(4), torch.tensor([50, 10, 30, 10]))
+    batch = {"photon_flux": torch.rand(2, 100, 3), "photon_origin": kinds.float().view(1, -1, 1).expand(2, -1, 3)}
+    batch |= {"photon_hit": torch.rand(2, 100, 3), "point_position": torch.rand(2, 9, 3), "depth": torch.ones(2)}
+    module = NeuralLightTransport(photons=True, width=2, num_points=9, max_points=4, max_photons=20)
+    thin = module.thin(batch)
+    counts = np.bincount(thin["photon_origin"][0, :, 0].int().numpy())
+    assert counts.tolist() == [10, 2, 6, 2]
+    rows = [int((batch["photon_hit"][0] == hit).all(1).nonzero()) for hit in thin["photon_hit"][0]]
+    assert len(set(rows)) == 20 and torch.equal(thin["photon_flux"], batch["photon_flux"][:, rows] * 5)
+    assert torch.equal(thin["point_position"], batch["point_position"][:, :4]) and thin["depth"] is batch["depth"]
+    again = module.thin(thin)
+    assert all(torch.equal(again[name], thin[name]) for name in thin)
+    assert module.num_photons == 20 and module.embedding.table.weight.shape[0] == 4
+    assert FeatureProjection(width=2, num_points=3, max_points=4).embedding.table.weight.shape[0] == 3
+
+
+# ---- the choice -----------------------------------------------------------------------------------------
+
+
+def test_paired_difference_of_one_seed():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(1, 0.1, (2, 1, 40)) + rng.normal(0, 5, 40)  # what images share cancels
+    mean, error = paired_difference(a, b)
+    assert np.isclose(mean, (a - b).mean()) and np.isclose(error, stats.sem((a - b)[0]))
+    t = stats.ttest_rel(a[0], b[0])
+    assert np.isclose(mean / error, t.statistic)
+
+
+@pytest.mark.parametrize(("images", "seeds", "rest"), [(1.0, 0.3, 0.5), (0.1, 0.5, 1.0), (0.5, 0.0, 0.1)])
+def test_paired_difference_over_seeds(images, seeds, rest):
+    """The squared standard error is the variance of the mean, which repeating the experiment shows."""
+    rng = np.random.default_rng(1)
+    count, n = 5, 12
+    means, squares = [], []
+    for _ in range(4000):
+        d = rng.normal(0, images, n) + rng.normal(0, seeds, (count, 1)) + rng.normal(0, rest, (count, n))
+        mean, error = paired_difference(d, np.zeros_like(d))
+        means.append(mean)
+        squares.append(error**2)
+    assert 0.93 < np.mean(squares) / np.var(means) < 1.2  # never taken as too small: the larger of the two stays
+
+
+def test_choice_against_brute_force():
+    rng = np.random.default_rng(2)
+    disagreed = 0
+    for _ in range(200):
+        keys = [f"m{k}" for k in range(6)]
+        shared = rng.normal(0, 1, 15)
+        metrics = [{k: (rng.normal(rng.normal(0, 0.2), 0.5, 15) + shared)[None] for k in keys} for _ in range(2)]
+        cost = {k: float(rng.integers(1, 6)) for k in keys}
+        good = []
+        for errors in metrics:
+            best = sorted(keys, key=lambda k, e=errors: e[k].mean())[0]
+            d = {k: errors[k][0] - errors[best][0] for k in keys}
+            good.append({k for k in keys if k == best or d[k].mean() <= d[k].std(ddof=1) / np.sqrt(15)})
+            assert set(within(errors)) == good[-1]
+        both = good[0] & good[1]
+        disagreed += not both
+        assert cost[choose(metrics, cost)] == min(cost[k] for k in both or good[0])
+        assert choose(metrics, cost) in (both or good[0])
+    assert disagreed
+
+
+def test_ranking_against_brute_force():
+    """A candidate comes after all that beat it; the first are the Pareto front."""
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        points = {k: rng.integers(0, 5, 3) for k in range(8)}
+        metrics = [{k: np.full((1, 4), float(p[m])) for k, p in points.items()} for m in (0, 1)]
+        order = ranked(metrics, {k: float(p[2]) for k, p in points.items()})
+        beats = lambda a, b, p=points: (p[a] <= p[b]).all() and (p[a] != p[b]).any()
+        front = {k for k in points if not any(beats(other, k) for other in points)}
+        assert sorted(order) == list(range(8)) and set(order[: len(front)]) == front
+        for a, b in itertools.permutations(points, 2):
+            assert not beats(a, b) or order.index(a) < order.index(b)
