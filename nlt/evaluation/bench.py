@@ -61,6 +61,7 @@ GRID: dict[str, Sequence[int]] = {
 _POWER = {"resolution": 2, "width": 2}  # at most, of the cost; of other factors 1
 _SAMPLES = 8  # that are rendered for the frames, at least
 _TRAINING_STEPS = 40
+_RECORDED = 2  # calls in which dr.freeze records; the second, what the first took for constant
 _JOURNAL, _WORK = "points.jsonl", "samples"  # in the directory for work in progress
 _SAFE = 0.8  # of the free memory
 
@@ -406,21 +407,23 @@ class _Bench:
         stages: list[dict[str, float]] = []
         pairs: list[tuple[float, float]] = []
         begin = time.perf_counter()
-        while len(pairs) < 3 or (time.perf_counter() - begin < self.seconds and len(pairs) < _TRAINING_STEPS):
+        while len(pairs) < _RECORDED + LEAST_FRAMES or (
+            time.perf_counter() - begin < self.seconds and len(pairs) < _TRAINING_STEPS
+        ):
             k = len(pairs) % _SAMPLES
             sample, ours = _timed(partial(render.sample, "train", k))
             camera, state = views[k - 1]  # not the state that the scene is in
             _, theirs = _timed(partial(bare.sample, state, camera, "train", k))
             pairs.append((ours, theirs))
             stages.append(laps(render, k, partial(write_shard, self.work / "shard", [sample])))
-        medians = {name: statistics.median(s[name] for s in stages[1:]) for name in stages[0]}
+        medians = {name: statistics.median(s[name] for s in stages[_RECORDED:]) for name in stages[0]}
         medians["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
         whole = sum(medians.values())
         return {
             "stages_s": medians,
             "train_per_second": 1 / (whole - medians["reference"]),
             "evaluated_per_second": 1 / whole,
-            "of_bare_loop": statistics.median(b / a for a, b in pairs[1:]),
+            "of_bare_loop": statistics.median(b / a for a, b in pairs[_RECORDED:]),
         }
 
 

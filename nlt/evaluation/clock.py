@@ -48,13 +48,13 @@ class Clock:
         """Seconds by stage of every timed frame, by method; the device is synchronised around every stage.
 
         The methods take turns at each frame, so that whatever else the machine does slows all. Warm-up 10 frames, then
-        40 timed ones; when `seconds` are over, fewer, but 1 and 3 at least.
+        40 timed ones; when `seconds` are over, fewer, but 2 and 3 at least.
         """
         methods = {name: method.to(self.device).eval() for name, method in methods.items()}
         rows = np.linspace(0, len(self.dataset) - 1, min(len(self.dataset), WARM_UP + FRAMES)).astype(int)
         timed: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
         begin, number = time.perf_counter(), 0
-        for most, least, share in ((WARM_UP, 1, _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
+        for most, least, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
             for laps in timed.values():
                 laps.clear()
             for k in range(most):

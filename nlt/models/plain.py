@@ -12,10 +12,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.metrics.display import expose
 from nlt.models.module import Batch, RenderingModule
+from nlt.models.unet import UNet
 
 
 def plain(method: RenderingModule) -> RenderingModule:
@@ -33,7 +35,7 @@ class _Plain(RenderingModule):
         return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
     def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
-        return expose(self.unet(features.contiguous()), 1 / batch["exposure"])
+        return expose(_unet(self.unet, features.contiguous()), 1 / batch["exposure"])
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         return {name: _in_float32(step) for name, step in super().steps().items()}
@@ -57,6 +59,23 @@ def _float32(device: str) -> Iterator[None]:
             yield
     finally:
         torch.set_float32_matmul_precision(precision)
+
+
+def _unet(net: UNet, x: Tensor) -> Tensor:
+    """The supplementary's figure, block by block: (B, C, H, W) to (B, 3, H, W)."""
+    levels = [_block(net.down[0], net.conv_in(x))]
+    for block in net.down[1:]:
+        levels.append(_block(block, F.max_pool2d(levels[-1], 2, ceil_mode=True)))
+    x = levels.pop()
+    for block in net.up:
+        skip = levels.pop()
+        upsampled = F.interpolate(x, skip.shape[-2:], mode="bilinear", align_corners=False)
+        x = _block(block, torch.cat([upsampled, skip], dim=1))
+    return net.conv_out(F.relu(x))
+
+
+def _block(block: Any, x: Tensor) -> Tensor:
+    return block.shortcut(x) + block.conv_1(F.relu(block.conv_0(F.relu(x))))
 
 
 def project(
