@@ -174,10 +174,13 @@ def _with_place(message: str, given: dict[str, str], command: str) -> str:
     return f"{place}: {message}; see nlt {command} --help"
 
 
+PRECISIONS = ("32-true", "bf16-mixed")  # of the trainings, as the device has it
+
+
 def trainer_defaults() -> dict[str, Any]:
     """What the trainer does unless a config says otherwise."""
     return {
-        "precision": "bf16-mixed" if Policy.for_device(default_device()).bfloat16 else "32-true",
+        "precision": PRECISIONS[Policy.for_device(default_device()).bfloat16],
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
         "default_root_dir": "runs",

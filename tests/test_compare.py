@@ -237,6 +237,7 @@ def test_manifest(world):
     assert (record["seeds"], record["n_test"]) == ([3], 3)
     assert record["versions"]["torch"] == torch.__version__
     assert record["wall_time_s"] > 0 and record["device"]
+    assert record["teachers"] == {"living_room": "path"}
 
 
 # ---- run again ------------------------------------------------------------------------------------------
@@ -247,6 +248,28 @@ def test_nothing_is_trained_twice(world, trainings):
     assert trainings == []
     for name, row in again.items():
         assert {key: row[key] for key in ACCURACY} == {key: world.rows[name][key] for key in ACCURACY}
+
+
+def test_a_second_device_adds_its_times(world, trainings, monkeypatch):
+    """Nothing is trained for it; the first one's times stay, those of a training that is no more are not shown."""
+    again = lambda *names: world.compare("--methods", *names, out="devices")
+    rows = again("cnn", "path_tracing_1")
+    here, defaults = compare.surroundings, training.trainer_defaults()
+    (other,) = {*training.PRECISIONS} - {defaults["precision"]}
+    monkeypatch.setattr(training, "trainer_defaults", lambda: defaults | {"precision": other})
+    monkeypatch.setattr(compare, "surroundings", lambda device: here(device) | {"device": "GPU, made up"})
+    second = again("cnn", "path_tracing_1")
+    assert trainings == []
+    results = load(world.folder / "devices")
+    assert results.devices == ["GPU, made up", here(torch.device("cpu"))["device"]]
+    for name in rows:
+        assert results.mean(name, "time_per_frame_s") == float(second[name]["time_per_frame_s"])
+        first = results.on(results.devices[1])
+        assert first.mean(name, "time_per_frame_s") == float(rows[name]["time_per_frame_s"])
+        assert first.mean(name, "gbuffer_s") == pytest.approx(float(rows[name]["gbuffer_s"] or "nan"), nan_ok=True)
+    assert len(results.timings) == 4 and "Time per frame by device" in (world.folder / "devices/table.md").read_text()
+    again("cnn")
+    assert len(load(world.folder / "devices").timings) == 3
 
 
 def test_one_methods_config_retrains_this_method(world, trainings):
@@ -525,7 +548,10 @@ def test_causes_of_failures(tmp_path):
     with (tmp_path / "failures.csv").open(newline="") as file:
         share = {row["cause"]: float(row["share_of_worst"]) for row in csv.DictReader(file)}
     assert share["mirror or glass"] == pytest.approx(0.1) and share["light not in view"] == pytest.approx(0.9)
-    assert "| CNN only | 10.0% | 0.0% | 0.0% | 90.0% | 0.0% |" in (tmp_path / "failures.md").read_text()
+    assert (
+        "| CNN only | 10.0% (16) | 0.0% (0) | 0.0% (0) | 90.0% (144) | 0.0% (0) |"
+        in (tmp_path / "failures.md").read_text()
+    )
 
 
 @pytest.mark.parametrize("name", paths.config_names("compare"))

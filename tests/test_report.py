@@ -13,28 +13,31 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_results import ODD, TROUBLED, make_results, make_troubled_results, papers_numbers
+from made_results import ODD, TROUBLED, make_results, make_troubled_results, papers_numbers, time_elsewhere
 from matplotlib import colormaps
 from playwright.sync_api import sync_playwright
 
 from nlt.evaluation import page as report_page
 from nlt.evaluation.claims import write_claims
+from nlt.evaluation.gallery import Shown, draw_failures
 from nlt.evaluation.packing import COARSEST, max_error, pack, pack_to_fit
 from nlt.evaluation.paper import label, published
-from nlt.evaluation.results import load
+from nlt.evaluation.results import load, write_rows
 from nlt.evaluation.tables import write_tables
 from nlt.metrics.display import display
 from nlt.metrics.quantities import QUANTITIES
 
 VIEWS, SIZE, EXPOSURE = 4, 32, 0.8  # of make_results
+GPU, FASTER = "GPU, made up", {m: 4 + k for k, m in enumerate(TROUBLED[:-1])}  # the last is not timed there
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     """The directory of results with their tables, claims and report."""
     directory = tmp_path_factory.mktemp("stored")
-    results = make_troubled_results(directory)
+    results = time_elsewhere(make_troubled_results(directory), GPU, **FASTER)
     write_tables(results)
+    draw_failures(Shown.load(results))
     report_page.write_page(results, write_claims(results))
     return directory
 
@@ -89,14 +92,14 @@ def latex_tables(text):
 def test_all_formats_carry_the_same_numbers(stored):
     markdown = markdown_tables((stored / "table.md").read_text())
     page = Tables((stored / "report.html").read_text()).tables
-    assert len(markdown) == 5
+    assert len(markdown) == 6
     assert latex_tables((stored / "table.tex").read_text()) == markdown
-    assert [page[f"table-{k}"] for k in range(5)] == markdown
+    assert [page[f"table-{k}"] for k in range(6)] == markdown
     with (stored / "table.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     heading = {f"{q.label}{f' ({q.unit})' if q.unit != '1' else ''}": key for key, q in QUANTITIES.items()}
     compared = 0
-    for table in markdown:
+    for table in markdown[:-1]:
         keys = [heading[column.rstrip(" ↓↑")] for column in table[0][1:]]
         for line, row in zip(table[1:], rows, strict=True):
             assert line[0].startswith(label(row["method"]))
@@ -114,6 +117,56 @@ def test_all_formats_carry_the_same_numbers(stored):
                 assert theirs == ("" if key not in (known := published("table2", row["method"])) or table is not
                                   markdown[0] else f"{known[key]:g}")  # fmt: skip
     assert compared > 150
+
+
+def test_times_by_device(stored):
+    """The last table: of each device the mean of what its rows say, made-up quotients of the first's."""
+    first, *lines = markdown_tables((stored / "table.md").read_text())[-1]
+    assert first[1:] == ["time / frame (s), (1)", "time / frame (s), (2)"]
+    assert f"(1) CPU, made up, (2) {GPU}" in (stored / "table.md").read_text()
+    cells = {line[0].partition(" [")[0]: line[1:] for line in lines}
+    results = load(stored)
+    assert results.devices == ["CPU, made up", GPU]
+    for method in TROUBLED:
+        here, there = (cell.partition(" ± ")[0] for cell in cells[label(method)])
+        mean = np.mean([run["time_per_frame_s"] for run in results.runs_of(method)])
+        assert here == f"{mean:.4f}"
+        assert there == (f"{mean / FASTER[method]:.4f}" if method in FASTER else "–")
+    times = results.on(GPU).runs_of("cnn")[0]
+    assert times["mse"] == results.runs_of("cnn")[0]["mse"] and results.on(GPU).manifest["commit"] == 20 * "cd"
+
+
+def test_times_of_another_training_are_not_shown(stored, tmp_path):
+    """A method that was trained anew was not timed on the other device; results without the file know one device."""
+    for path in stored.glob("*.[cj]s*"):
+        shutil.copy(path, tmp_path)
+    rows = [{**row, "run": "runs/another"} for row in load(tmp_path).timings]
+    write_rows(tmp_path / "timings.csv", rows)
+    assert load(tmp_path).devices == ["CPU, made up"]
+    (tmp_path / "timings.csv").unlink()
+    assert load(tmp_path).devices == ["CPU, made up"] and load(tmp_path).on("CPU, made up").runs == load(stored).runs
+
+
+def test_failures_are_those_of_the_file(stored):
+    """Counts in the page, in Markdown and in LaTeX."""
+    with (stored / "failures.csv").open(newline="") as file:
+        rows = {(label(row["method"]), row["cause"]): row for row in csv.DictReader(file)}
+    shown = Tables((stored / "report.html").read_text()).tables["failures"]
+    (header, *lines), (all_pixels,) = shown[:-1], shown[-1:]
+    assert len(lines) * (len(header) - 1) == len(rows)
+    for name, *cells in lines:
+        for cause, cell in zip(header[1:], cells, strict=True):
+            row = rows[name, cause]
+            assert cell == f"{100 * float(row['share_of_worst']):.1f}% ({int(row['pixels']):,})"
+            assert all_pixels[header.index(cause)] == f"{100 * float(row['share_of_all']):.1f}%"
+    assert markdown_tables((stored / "failures.md").read_text()) == [shown]
+    assert latex_tables((stored / "failures.tex").read_text()) == [shown]
+
+
+def test_the_teacher_is_named(stored):
+    note = "denoising's input: traced by bdpt in egg."
+    assert note in (stored / "table.md").read_text() and "kitchen" not in (stored / "table.md").read_text()
+    assert html.unescape((stored / "report.html").read_text()).count(note) == 1
 
 
 def test_without_images(stored, tmp_path):
@@ -321,11 +374,75 @@ def test_provenance(open_report, stored):
         assert value in text
     with (stored / "runs.csv").open(newline="") as file:
         exact = next(row["mse"] for row in csv.DictReader(file) if row["method"] == "cnn")
-    title = page.locator("#table-0 tbody tr", has_text="CNN only").locator("td").nth(1).get_attribute("title")
-    assert f"seed 0: {exact}" in title and "runs.csv" in title
+    page.locator("#table-0 tbody tr", has_text="CNN only").locator("td").nth(1).hover()
+    assert f"seed 0: {exact}" in page.locator("#origin").inner_text()
+    page.mouse.move(0, 0)
+    assert page.locator("#origin").inner_text() == ""
     with page.expect_download() as download:
         page.click("a[download='table.tex']")
     assert download.value.path().read_bytes() == (stored / "table.tex").read_bytes()
+
+
+def test_provenance_by_keyboard(open_report, stored):
+    """Every cell of every table is reached by arrows from the table's one tab stop; it says where it is from."""
+    page = open_report().page
+    active = "document.activeElement"
+    heading = page.locator("#table-0 thead button").first
+    heading.focus()
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate(f"{active}.textContent") == label(TROUBLED[0])
+    for _ in range(TROUBLED.index("nlt")):
+        page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    exact = next(run["mse"] for run in load(stored).runs if run["method"] == "nlt")
+    said = page.locator("#origin")
+    for part in (
+        "Ours (w/o photons) [1 of 2 diverged], MSE ↓: ", f"seed 0: {exact!r}", "runs.csv, column mse", "views.csv",
+        "seed 0, checkpoint in runs/nlt-0", "seed 1, diverged: train/loss is nan", "N = 12 test views", "CPU, made up",
+        "commit abababababab", "nlt compare --config made_up",
+    ):  # fmt: skip
+        assert part in said.inner_text(), part
+    assert said.get_attribute("role") == "status" and page.locator("#table-0").get_attribute("role") == "grid"
+    place = f"(e => [e.parentElement.rowIndex, e.cellIndex])({active}.closest('td, th'))"
+    for key, at in (
+        ("End", [5, 5]), ("ArrowRight", [5, 5]), ("Home", [5, 0]), ("Control+End", [9, 5]), ("ArrowUp", [8, 5]),
+        ("Control+Home", [0, 0]),
+    ):  # fmt: skip
+        page.keyboard.press(key)
+        assert page.evaluate(place) == at, key
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")  # a heading sorts
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate(place) == [1, 1]
+    page.keyboard.press("Escape")
+    assert said.inner_text() == ""
+    page.keyboard.press("Tab")  # out of the table, and back to the cell that was left
+    page.keyboard.press("Shift+Tab")
+    assert page.evaluate(place) == [1, 1] and "time_per_frame_s" in said.inner_text()
+    tables = page.locator("table.grid")
+    stops = tables.evaluate_all("all => all.map(t => [t.querySelectorAll('[tabindex=\"0\"]').length, t.id])")
+    assert [count for count, _ in stops] == [1] * len(stops)
+    assert {"table-5", "failures", "runs", "comparisons-real-time"} <= {name for _, name in stops}
+    silent = tables.evaluate_all("""all => all.flatMap(t => [...t.tBodies[0].rows].flatMap(r => [...r.cells].slice(1)
+        .filter(c => !/\\.(csv|json)/.test(originOf(c))).map(c => `${t.id}: ${c.textContent}`)))""")
+    assert silent == []
+
+
+def test_device(open_report):
+    """The chart and the stages, on the same scale, of either device; the one that a method lacks is said."""
+    page = open_report().page
+    code = "all => all.map(p => [p.dataset.method, Number(p.querySelector('.ring').getAttribute('cx'))])"
+    at = lambda: dict(page.locator("#chart .point").evaluate_all(code))
+    here = at()
+    assert page.locator("#device option").all_text_contents() == ["CPU, made up", GPU]
+    page.select_option("#device", label=GPU)
+    there = at()
+    assert set(here) - set(there) == {TROUBLED[-1]}
+    assert f"{label(TROUBLED[-1])} (not measured)" in page.locator("#chart-note").inner_text()
+    moved = [(here[m] - there[m]) / np.log(FASTER[m]) for m in there]
+    assert moved == pytest.approx([moved[0]] * len(moved), rel=1e-3) and moved[0] > 10
+    assert label(TROUBLED[-1]) not in page.locator("#stages").inner_text()
 
 
 @pytest.mark.parametrize("ev", [0, 2.5, -3])

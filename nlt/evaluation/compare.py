@@ -26,6 +26,7 @@ from nlt.evaluation.results import (
     write_images,
     write_manifest,
     write_rows,
+    write_timings,
 )
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.evaluation.trainings import obtain
@@ -61,6 +62,7 @@ def compare(
         "seeds": comparison.seeds,
         "dataset": dataset.name,
         "scenes": [description.name for description in spec.descriptions],
+        "teachers": frames.teachers(),
         "n_test": len(test),
         "shown": test.shown,
         "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
@@ -91,6 +93,7 @@ def compare(
             print(live_header())
         print(live_row(run), flush=True)
         write_rows(directory / RUNS, runs)
+        write_timings(directory, record, runs)
         write_rows(directory / VIEWS, views)
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         write_tables(load(directory))

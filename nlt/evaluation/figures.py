@@ -139,52 +139,73 @@ def _scatter(pixels: Tensor, colours: Tensor, height: int, width: int) -> Tensor
 
 
 def draw_speed_accuracy(results: Results) -> None:
-    """speed_accuracy.png and .svg: accuracy over time per frame, a panel per metric.
+    """speed_accuracy.png and .svg: accuracy over time per frame, a panel per metric; all of them for each device.
 
     Methods of one class that path trace are a curve, labelled by their pixels or samples per pixel. Bars are the
     standard deviation over seeds, with one seed the 95% interval over test views. The grey line is the Pareto front.
     """
-    timed = [m for m in results.methods if math.isfinite(results.mean(m, "time_per_frame_s"))]
+    seconds = {
+        device: {m: time for m in results.methods if math.isfinite(time := on.mean(m, "time_per_frame_s"))}
+        for device in results.devices
+        for on in [results.on(device)]
+    }
+    timed = {m: time for times in seconds.values() for m, time in times.items()}
     panels = [key for key in _PANELS if any(math.isfinite(results.mean(m, key)) for m in timed)]
     if not panels:
         return
     columns = math.ceil(len(panels) / 2)
-    figure, axes = plt.subplots(2, columns, figsize=(3.3 * columns, 6.4), squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_axis_off()
-    families = curves(results)
-    in_curves = {method for members in families.values() for method in members}
-    points = [method for method in results.methods if method not in in_curves]
-    for axis, key in zip(axes.flat, panels, strict=False):
-        at = {m: (1e3 * results.mean(m, "time_per_frame_s"), results.mean(m, key)) for m in timed}
-        at = {m: place for m, place in at.items() if math.isfinite(place[1])}
-        front = _pareto_front(at, METRICS[key].direction)
-        axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
-        for k, (name, members) in enumerate(families.items()):
-            found = [m for m in members if m in at]
-            style = {"color": _CURVES[k % len(_CURVES)], "ls": DASHES[k % 4], "marker": "x+."[k % 3]}
-            _plot(axis, results, key, found, at, name, style)
-            for number, m in enumerate(found):
-                part = label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
-                axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
-                              fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
-        for k, m in enumerate(m for m in points if m in at):
-            style = {"color": COLOURS[k % len(COLOURS)], "ls": "", "marker": MARKERS[k % len(MARKERS)]}
-            _plot(axis, results, key, [m], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3})
-        axis.set_xscale("log")
-        axis.margins(0.09, 0.12)
-        narrow = max(x for x, _ in at.values()) < 30 * min(x for x, _ in at.values())
-        axis.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5) if narrow else (1,)))
+    heights = [*[6.1] * len(seconds), 0.6]  # inches; the last for the legend
+    figure = plt.figure(figsize=(3.3 * columns, sum(heights)))
+    *blocks, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    axes = np.stack([block.subplots(2, columns, squeeze=False).ravel() for block in blocks])
+    for device, block, row in zip(seconds, blocks, axes, strict=True):
+        block.suptitle(f"Timed on {device}" if device else "", fontsize=10)
+        block.subplots_adjust(0.14 / columns, 0.08, 1 - 0.03 / columns, 0.9, 0.18, 0.38)
+        for axis, key, first in zip(row, panels, axes[0], strict=False):
+            at = {m: (1e3 * time, results.mean(m, key)) for m, time in seconds[device].items()}
+            _speed_accuracy(axis, results, key, {m: place for m, place in at.items() if math.isfinite(place[1])})
+            axis.sharex(axes[0][0])  # one scale shows what a device gains
+            axis.sharey(first)
+        for axis in row[len(panels) :]:
+            axis.set_axis_off()
+    every = [time for times in seconds.values() for time in times.values()]
+    subs = (1, 2, 5) if max(every) < 30 * min(every) else (1,)
+    for axis in axes[:, : len(panels)].flat:
+        axis.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=subs))
         axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         axis.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
-        axis.set_xlabel("time per frame (ms)", fontsize=8)
-        axis.set_title(heading(key), fontsize=9)
-        axis.tick_params(labelsize=8)
-        axis.grid(alpha=0.3)
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), fontsize=8, frameon=False)
-    figure.tight_layout(rect=(0, 0.01 + 0.03 * math.ceil(len(labels) / 6), 1, 1))
+    named: dict[str, Any] = {}
+    for axis in axes.flat:
+        named = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True)) | named
+    below.legend(named.values(), named, loc="center", ncols=min(6, len(named)), fontsize=8, frameon=False)
     save(figure, results.directory, "speed_accuracy")
+
+
+def _speed_accuracy(axis: plt.Axes, results: Results, key: str, at: Mapping[str, tuple[float, float]]) -> None:
+    """A panel: the methods at their places, time in ms and metric."""
+    families = curves(results)
+    in_curves = {method for members in families.values() for method in members}
+    if front := _pareto_front(at, METRICS[key].direction):
+        axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
+    for k, (name, members) in enumerate(families.items()):
+        found = [m for m in members if m in at]
+        style = {"color": _CURVES[k % len(_CURVES)], "ls": DASHES[k % 4], "marker": "x+."[k % 3]}
+        _plot(axis, results, key, found, at, name, style)
+        for number, m in enumerate(found):
+            part = label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
+            axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
+                          fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
+    for k, m in enumerate(m for m in results.methods if m not in in_curves):
+        style = {"color": COLOURS[k % len(COLOURS)], "ls": "", "marker": MARKERS[k % len(MARKERS)]}
+        _plot(
+            axis, results, key, [m] if m in at else [], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3}
+        )
+    axis.set_xscale("log")
+    axis.margins(0.09, 0.12)
+    axis.set_xlabel("time per frame (ms)", fontsize=8)
+    axis.set_title(heading(key), fontsize=9)
+    axis.tick_params(labelsize=8)
+    axis.grid(alpha=0.3)
 
 
 def _plot(
@@ -206,9 +227,9 @@ def _plot(
 
 def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, float]:
     """How far an error bar reaches below and above the mean: the deviation over seeds, else the 95% interval."""
-    std, (low, high) = results.std(method, key), results.interval(method, key)
-    if math.isfinite(std):
+    if math.isfinite(std := results.std(method, key)):
         return std, std
+    low, high = results.interval(method, key)
     return (max(mean - low, 0), max(high - mean, 0)) if math.isfinite(low) else (0, 0)
 
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
-from nlt.rendering.renderer import Renderer
+from nlt.rendering.renderer import Renderer, choose_teacher
+from nlt.rendering.variant import use_variant
 from nlt.scenes.camera import Camera
 
 
@@ -24,6 +25,12 @@ class Frames:
         self.dataset = dataset
         self._renderer = renderer or cache(lambda scene: SampleRenderer(dataset.spec, scene))
         self.traced = cache(self._traced)
+
+    def teachers(self) -> dict[str, str]:
+        """The integrator that traces radiance in each scene, on this machine."""
+        use_variant()
+        spec = self.dataset.spec
+        return {scene.name: choose_teacher(scene.teacher, spec.teacher) for scene in spec.descriptions}
 
     def place(self, index: int) -> tuple[Renderer, Camera]:
         """Put a sample's scene into its state; what renders it, and its camera."""

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import matplotlib
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from nlt.data.files import write_bytes
 from nlt.evaluation.figures import grid, save, shown
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import Results, write_rows
+from nlt.evaluation.results import Results, read_rows, write_rows
+from nlt.evaluation.tables import Table, write_texts
 
 import matplotlib.pyplot as plt  # isort: skip  after figures.py has chosen the backend
 
+FAILURES = "failures.csv"
 _VIEWS = 3  # in qualitative.png
 _INSET = 4  # a side of the image over a side of the inset
 WORST = 0.1  # of a method's pixels
@@ -135,7 +137,7 @@ def worst_pixels(images: Shown, method: str) -> np.ndarray:
 
 
 def draw_failures(images: Shown) -> None:
-    """failures.png, .csv and .md: each method's worst tenth of the pixels, and what is in them, counted.
+    """failures.png, .csv, .md and .tex: each method's worst tenth of the pixels, and what is in them, counted.
 
     The picture shows the view with most of them: prediction, reference, error, and the worst pixels in the colour of
     the first cause that applies.
@@ -160,19 +162,31 @@ def draw_failures(images: Shown) -> None:
     handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in CAUSES.values()]
     figure.legend(handles, CAUSES, loc="lower center", ncols=len(CAUSES), fontsize=7, frameon=False)
     save(figure, images.results.directory, "failures", ("png",))
-    write_rows(images.results.directory / "failures.csv", rows)
-    write_bytes(images.results.directory / "failures.md", _failures_markdown(images, rows).encode())
+    write_rows(images.results.directory / FAILURES, rows)
+    counted = failures(images.results)
+    assert counted
+    write_texts(images.results, "failures", [counted], f"images/*.npz, {FAILURES}")
 
 
-def _failures_markdown(images: Shown, rows: list[dict]) -> str:
-    share = {(row["method"], row["cause"]): row["share_of_worst"] for row in rows}
-    everywhere = {row["cause"]: row["share_of_all"] for row in rows}
-    lines = [
-        "# What is in the worst pixels", "",
-        f"Of each method's worst tenth of the pixels in {len(images.reference)} test views, the share to which a cause "
-        "applies; several may. Above what it is in all pixels, the cause goes with errors.", "",
-        f"| method | {' | '.join(CAUSES)} |", "|---|" + "---:|" * len(CAUSES),
-        *(f"| {label(m)} | " + " | ".join(f"{share[m, c]:.1%}" for c in CAUSES) + " |" for m in images.methods),
-        "| all pixels | " + " | ".join(f"{everywhere.get(c, 0):.1%}" for c in CAUSES) + " |", "",
-    ]  # fmt: skip
-    return "\n".join(lines)
+def failures(results: Results) -> Table | None:
+    """The counts of failures.csv; None where it is not there."""
+    path = results.directory / FAILURES
+    if not path.exists():
+        return None
+    by_method: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in read_rows(path):
+        by_method.setdefault(row["method"], {})[row["cause"]] = row
+    causes = list(next(iter(by_method.values())))
+    everywhere = [next(iter(by_method.values()))[cause]["share_of_all"] for cause in causes]
+    counts = [
+        [label(method), *(f"{of[cause]['share_of_worst']:.1%} ({of[cause]['pixels']:,})" for cause in causes)]
+        for method, of in by_method.items()
+    ]
+    return Table(
+        "What is in the worst pixels",
+        f"Of each method's worst tenth of the pixels in {len(results.manifest['shown'])} test views, the share to "
+        "which a cause applies and the number of pixels; several causes may apply to one. Above what it is in all "
+        "pixels, the cause goes with errors.",
+        causes,
+        [*counts, ["all pixels", *(f"{share:.1%}" for share in everywhere)]],
+    )

@@ -6,6 +6,8 @@ import base64
 import io
 import json
 import math
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
@@ -20,10 +22,10 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.claims import Claim, Comparison
 from nlt.evaluation.claims import text as claim_text
 from nlt.evaluation.figures import bar, curves
-from nlt.evaluation.gallery import Shown
+from nlt.evaluation.gallery import FAILURES, Shown, failures
 from nlt.evaluation.packing import max_error, pack_to_fit
 from nlt.evaluation.paper import label, paper
-from nlt.evaluation.results import OK, Results
+from nlt.evaluation.results import OK, TIMES, Results
 from nlt.evaluation.tables import Table, heading, tables, text
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
@@ -32,9 +34,12 @@ _PARTS = Path(__file__).parent / "page"
 _SIZE = 25_000_000  # bytes of the file, at most
 _OTHER = 500_000  # of these, for what describes the images and the methods
 _AXES = ("time_per_frame_s", "flops", "parameters", "peak_memory_bytes")
-_RUN = ("method", "seed", "status", "message", "steps", "trained_at_commit")
+_RUN = ("seed", "status", "message", "steps", "trained_at_commit", "run")
 _MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not measured": "–"}
-_FILES = ("table.csv", "table.md", "table.tex", "runs.csv", "views.csv", "manifest.json")
+_FILES = (
+    *("table.csv", "table.md", "table.tex", "runs.csv", "timings.csv", "views.csv"),
+    *("failures.csv", "failures.md", "failures.tex", "claims.md", "claims.json", "manifest.json"),
+)
 _WEBP = 90  # quality of pixel figures, which lie beside the report as they are
 
 
@@ -49,15 +54,16 @@ def write_page(results: Results, claims: list[Claim]) -> None:
         "summary": _summary(results),
         "style": (_PARTS / "report.css").read_text(),
         "script": (_PARTS / "report.js").read_text(),
-        "claims": _claims(claims),
+        "claims": _claims(results, claims),
         "tables": "\n".join(_table(results, table, number) for number, table in enumerate(tables(results))),
+        "failures": _failures(results),
         "files": _files(results),
         "figures": _figures(results),
         "provenance": _provenance(results),
     }
     packed, data = _images(results, _SIZE - sum(map(len, parts.values())) - _OTHER)
     data |= {"methods": _methods(results), "curves": curves(results), "quantities": _quantities(results)}
-    data["stages"] = list(STAGES)
+    data |= {"stages": list(STAGES), "devices": results.devices}
     images = "\n".join(
         f'<script type="text/plain" id="images-{k}">{base64.b64encode(view).decode()}</script>'
         for k, view in enumerate(packed)
@@ -75,7 +81,8 @@ def _json(data: Any) -> str:
 
 
 def _quantities(results: Results) -> dict[str, dict[str, Any]]:
-    measured = [key for key in QUANTITIES if any(len(results.values(method, key)) for method in results.methods)]
+    everywhere = [results.on(device) for device in results.devices]
+    measured = [key for key in QUANTITIES if any(len(on.values(m, key)) for on in everywhere for m in results.methods)]
     return {
         key: {
             "heading": heading(key),
@@ -90,23 +97,27 @@ def _quantities(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def _methods(results: Results) -> list[dict[str, Any]]:
-    found = []
-    for method in results.methods:
-        values = {}
-        for key in QUANTITIES:
-            mean = results.mean(method, key)
-            if math.isfinite(mean):
-                below, above = bar(results, method, key, mean)
-                values[key] = [mean, mean - below, mean + above, text(key, mean)]
-        found.append(
-            {
-                "id": method,
-                "label": label(method),
-                "status": results.status(method),
-                "values": values,
-            }
-        )
-    return found
+    others = [key for key in QUANTITIES if key not in TIMES]
+    return [
+        {
+            "id": method,
+            "label": label(method),
+            "status": results.status(method),
+            "values": _values(results, method, others),
+            "times": [_values(results.on(device), method, TIMES) for device in results.devices],
+        }
+        for method in results.methods
+    ]
+
+
+def _values(results: Results, method: str, keys: Iterable[str]) -> dict[str, list[Any]]:
+    """Mean, ends of its error bar, and text of each quantity that was measured."""
+    values = {}
+    for key in keys:
+        if key in QUANTITIES and math.isfinite(mean := results.mean(method, key)):
+            below, above = bar(results, method, key, mean)
+            values[key] = [mean, mean - below, mean + above, text(key, mean)]
+    return values
 
 
 def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
@@ -190,50 +201,118 @@ def _commit(manifest: Any) -> str:
     return commit + (" with uncommitted changes" if manifest.get("uncommitted_changes") else "")
 
 
-def _table(results: Results, table: Table, number: int) -> str:
-    """Sortable; the best of each metric is bold; a cell's title says what the number is."""
-    key_of = {heading(key): key for key in QUANTITIES}
-    keys = [key_of.get(column) for column in table.columns]
-    best = {k: _best(results, key) for k, key in enumerate(keys) if key in METRICS}
-    cells = []
-    for index, (method, (name, *row)) in enumerate(zip(results.methods, table.rows, strict=True)):
-        cells.append(f'<tr data-index="{index}"><th scope="row">{escape(name)}</th>')
-        for k, cell in enumerate(row):
-            chosen = ' class="best"' if best.get(k) == method else ""
-            cells.append(f'<td{chosen} title="{escape(_origin(results, method, keys[k]))}">{escape(cell)}</td>')
-        cells.append("</tr>")
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return (
-        f'<h3 id="table-{number}-title">{escape(table.title)}</h3>{note}'
-        f'<div class="scroll" role="region" tabindex="0" aria-labelledby="table-{number}-title">'
-        f'<table id="table-{number}" aria-labelledby="table-{number}-title"><thead><tr>'
-        + "".join(
-            f'<th scope="col" data-direction="{QUANTITIES[key].direction if key else "lower"}">'
-            f'<button type="button">{escape(column)}</button></th>'
-            for key, column in zip([None, *keys], ["method", *table.columns], strict=True)
+@dataclass(frozen=True)
+class _Origins:
+    """Where a grid's numbers come from: said of all, of a column, of a row and of a cell; report.js joins them."""
+
+    table: str
+    columns: list[str]
+    rows: list[str] = field(default_factory=list)
+    cells: list[list[str]] = field(default_factory=list)
+
+
+def _grid(name: str, title: str, table: Table, origins: _Origins, best: Collection[tuple[int, int]] = ()) -> str:
+    """A table that sorts and whose cells are reached by keyboard; `best`: (row, column) of those in bold."""
+    origin = lambda said: f' data-origin="{escape(said)}"' if said else ""
+    directions = [QUANTITIES[key].direction for key, _ in table.sources] or ["lower"] * len(table.columns)
+    rows = []
+    for r, (head, *row) in enumerate(table.rows):
+        cells = "".join(
+            f"<td{' class=best' * ((r, c) in best)}{origin(origins.cells[r][c] if origins.cells else '')}>"
+            f"{escape(cell)}</td>"
+            for c, cell in enumerate(row)
         )
-        + f"</tr></thead><tbody>{''.join(cells)}</tbody></table></div>"
+        of_row = origin(origins.rows[r] if origins.rows else "")
+        rows.append(f'<tr data-index="{r}"{of_row}><th scope="row">{escape(head)}</th>{cells}</tr>')
+    headings = zip(["method", *table.columns], ["lower", *directions], ["", *origins.columns], strict=True)
+    return (
+        f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(title)}">'
+        f'<table class="grid" id="{escape(name)}" aria-label="{escape(title)}"{origin(origins.table)}><thead><tr>'
+        + "".join(
+            f'<th scope="col" data-direction="{direction}"{origin(said)}>'
+            f'<button type="button">{escape(column)}</button></th>'
+            for column, direction, said in headings
+        )
+        + f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 
-def _best(results: Results, key: str | None) -> str | None:
-    means = {method: results.mean(method, str(key)) for method in results.methods}
+def _titled(table: Table, grid: str) -> str:
+    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
+    return f"<h3>{escape(table.title)}</h3>{note}{grid}"
+
+
+def _table(results: Results, table: Table, number: int) -> str:
+    """The best of each metric is bold."""
+    keys = [key for key, _ in table.sources]
+    chosen = [(_best(results, key), c) for c, key in enumerate(keys) if key in METRICS]
+    best = {(results.methods.index(method), c) for method, c in chosen if method is not None}
+    origins = _Origins(
+        _measured(results),
+        [_column(results, *source) for source in table.sources],
+        [_trainings(results, method) for method in results.methods],
+        [[_numbers(of, method, key) for key, of in table.sources] for method in results.methods],
+    )
+    return _titled(table, _grid(f"table-{number}", table.title, table, origins, best))
+
+
+def _best(results: Results, key: str) -> str | None:
+    means = {method: results.mean(method, key) for method in results.methods}
     means = {method: mean for method, mean in means.items() if math.isfinite(mean)}
-    choose = min if QUANTITIES[str(key)].direction == "lower" else max
+    choose = min if QUANTITIES[key].direction == "lower" else max
     return choose(means, key=means.__getitem__, default=None)
 
 
-def _origin(results: Results, method: str, key: str | None) -> str:
-    """Where a number comes from, to the digit."""
-    if key is None:
-        return ""
+def _measured(results: Results) -> str:
+    manifest = results.manifest
+    facts = [
+        f"N = {manifest['n_test']} test views",
+        manifest.get("device", ""),
+        f"commit {_commit(manifest)}",
+        manifest.get("command", ""),
+    ]
+    return "; ".join(filter(None, facts))
+
+
+def _column(results: Results, key: str, of: Results) -> str:
+    """The file and column that a column's numbers are from."""
+    if of is not results:
+        return f"timings.csv, column {key}, of {of.manifest['device']} at commit {_commit(of.manifest)}"
+    return f"runs.csv, column {key}" + (f"; its interval: views.csv, column {key}" if QUANTITIES[key].per_image else "")
+
+
+def _trainings(results: Results, method: str) -> str:
+    """The runs of a method: seed, directory of the training, steps, commit."""
+    found = []
+    for run in results.runs:
+        if run["method"] != method:
+            continue
+        facts = [f"seed {run['seed']}"] + ([f"{run['status']}: {run['message']}"] if run["status"] != OK else [])
+        facts += [f"checkpoint in {run['run']}"] if isinstance(run.get("run"), str) else ["without training"]
+        for name, key in (("steps", "steps"), ("trained at commit", "trained_at_commit")):
+            facts += [f"{name} {value[:12]}"] if (value := _plain(run.get(key))) else []
+        found.append(", ".join(facts))
+    return "\n".join(found)
+
+
+def _numbers(results: Results, method: str, key: str) -> str:
+    """What was measured, to the digit."""
     runs = results.runs_of(method)
     parts = [f"seed {run['seed']}: {run[key]!r}" for run in runs if math.isfinite(run.get(key, math.nan))]
     low, high = results.interval(method, key)
     if math.isfinite(low):
         parts.append(f"95% interval over views: {low:.6g} to {high:.6g}")
-    where = f"runs.csv, column {key}, {_commit(results.manifest)}"
-    return "; ".join([*parts, where]) if parts else f"not measured; {results.status(method)}"
+    return "; ".join(parts) if parts else f"not measured; {results.status(method)}"
+
+
+def _failures(results: Results) -> str:
+    """The counts beside the figure."""
+    table = failures(results)
+    if table is None:
+        return ""
+    columns = [f"{FAILURES}, share_of_worst and pixels of the cause {cause}" for cause in table.columns]
+    origins = _Origins(f"images/*.npz of seed {results.manifest['seeds'][0]}; {_measured(results)}", columns)
+    return _titled(table, _grid("failures", table.title, table, origins))
 
 
 def _figures(results: Results) -> str:
@@ -266,7 +345,7 @@ def _files(results: Results) -> str:
     )
 
 
-def _claims(claims: list[Claim]) -> str:
+def _claims(results: Results, claims: list[Claim]) -> str:
     """A line per claim, which opens into its comparisons; nothing where the results' table makes none."""
     if not claims:
         return ""
@@ -274,18 +353,22 @@ def _claims(claims: list[Claim]) -> str:
     count = ", ".join(f"{v}: {verdicts.count(v)}" for v in _MARKS if v in verdicts)
     lines = []
     for claim in claims:
-        rows = "".join(
-            f"<tr><td>{escape(label(c.method))}</td><td>{escape(label(c.other))}</td><td>{escape(heading(c.metric))}</td>"
-            f"<td>{_margin(c)}</td><td>{_MARKS[c.verdict]} {c.verdict}</td></tr>"
-            for c in claim.comparisons
+        table = Table(
+            claim.id,
+            "",
+            ["against", "metric", "margin", "verdict"],
+            [
+                [label(c.method), label(c.other), heading(c.metric), _margin(c), f"{_MARKS[c.verdict]} {c.verdict}"]
+                for c in claim.comparisons
+            ],
         )
+        origins = _Origins(f"claims.json; computed from runs.csv and views.csv, {_measured(results)}", [""] * 4)
         lines.append(
             f'<details id="{escape(claim.id)}"><summary><span class="verdict {claim.verdict.replace(" ", "-")}">'
             f"{_MARKS[claim.verdict]} {claim.verdict}</span> {escape(claim.says)}</summary>"
-            f'<p class="note">{escape(claim.where)}. What decides: {escape(claim_text(claim))}.</p><div class="scroll" '
-            f'role="region" tabindex="0" aria-label="Comparisons of {escape(claim.id)}"><table><thead><tr>'
-            + "".join(f'<th scope="col">{name}</th>' for name in ("method", "against", "metric", "margin", "verdict"))
-            + f"</tr></thead><tbody>{rows}</tbody></table></div></details>"
+            f'<p class="note">{escape(claim.where)}. What decides: {escape(claim_text(claim))}.</p>'
+            + _grid(f"comparisons-{claim.id}", f"Comparisons of {claim.id}", table, origins)
+            + "</details>"
         )
     return (
         '<section id="claims" aria-labelledby="claims-title"><h2 id="claims-title">Claims of the paper</h2>'
@@ -319,23 +402,22 @@ def _provenance(results: Results) -> str:
     configs = manifest.pop("configs", {})
     facts = "".join(f"<dt>{escape(k.replace('_', ' '))}</dt><dd>{_fact(v)}</dd>" for k, v in manifest.items())
     keys = [key for key in QUANTITIES if any(math.isfinite(run.get(key, math.nan)) for run in results.runs)]
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in (*_RUN, *map(heading, keys)))
-    rows = "".join(
-        "<tr>"
-        + "".join(f"<td>{escape(_plain(run.get(name)))}</td>" for name in _RUN)
-        + "".join(f"<td>{escape(text(key, run.get(key)))}</td>" for key in keys)
-        + "</tr>"
-        for run in results.runs
+    every = Table(
+        "Every run",
+        "",
+        [*_RUN, *map(heading, keys)],
+        [
+            [run["method"], *(_plain(run.get(name)) for name in _RUN), *(text(key, run.get(key)) for key in keys)]
+            for run in results.runs
+        ],
     )
-    return (
-        f"<dl>{facts}</dl><h3>Every run</h3>"
-        f'<div class="scroll" role="region" tabindex="0" aria-label="Every run"><table id="runs"><thead><tr>{head}</tr>'
-        f"</thead><tbody>{rows}</tbody></table></div><h3>Configurations</h3>"
-        + "".join(
-            f"<details><summary>{escape(label(method))}</summary>"
-            f"<pre>{escape(yaml.safe_dump(config, sort_keys=False))}</pre></details>"
-            for method, config in configs.items()
-        )
+    columns = [f"runs.csv, column {name}" for name in (*_RUN, *keys)]
+    cells = [["" for _ in _RUN] + [_plain(run.get(key)) for key in keys] for run in results.runs]
+    grid = _grid("runs", every.title, every, _Origins(_measured(results), columns, cells=cells))
+    return f"<dl>{facts}</dl>{_titled(every, grid)}<h3>Configurations</h3>" + "".join(
+        f"<details><summary>{escape(label(method))}</summary>"
+        f"<pre>{escape(yaml.safe_dump(config, sort_keys=False))}</pre></details>"
+        for method, config in configs.items()
     )
 
 

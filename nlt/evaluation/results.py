@@ -7,6 +7,9 @@ results/NAME/ holds
 - `runs.csv`: a row per method and seed with every number as it was measured, by the keys of `QUANTITIES`; `status`
   is ok, diverged or failed, and `message` says why; `family` is the method's class, `spp` and `pixel_fraction` what
   of a frame it path traces, `run` the directory of its training;
+- `timings.csv`: a row per method, seed and device with what the clock measured there, in seconds, by the same names.
+  The rows of other devices stay when a comparison is made again, as long as dataset and trainings (`run`) are theirs;
+  runs.csv, and with it the tables, are of the manifest's `device`;
 - `views.csv`: a row per method, seed and test view with the metrics of that image. `fid_without` and `kid_without`
   are those of the test set without the view's jackknife group: they carry these metrics' uncertainty;
 - `images/METHOD.npz`, not in git: `radiance` (V, 3, H, W), float16, linear, of the first seed, for the shown views.
@@ -19,11 +22,12 @@ Tables, figures and claims (report.py) are made from these alone.
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,21 +37,24 @@ import scipy.stats
 
 from nlt.data.files import write_bytes
 from nlt.errors import UserError
-from nlt.metrics.quantities import QUANTITIES
+from nlt.metrics.quantities import QUANTITIES, STAGES
 
-MANIFEST, RUNS, VIEWS, IMAGES = "manifest.json", "runs.csv", "views.csv", "images"
+MANIFEST, RUNS, TIMINGS, VIEWS, IMAGES = "manifest.json", "runs.csv", "timings.csv", "views.csv", "images"
 OK, DIVERGED, FAILED = "ok", "diverged", "failed"
 LEVEL, _RESAMPLES = 0.95, 2000
+# What the clock measures.
+TIMES = tuple(f"{name}{of}_s" for name in (*STAGES, "time_per_frame") for of in ("", "_p95", "_error"))
 
 
 @dataclass(frozen=True)
 class Results:
-    """What `load` reads; `runs` and `views` are the rows of the two files, numbers as numbers."""
+    """What `load` reads; `runs`, `views` and `timings` are the rows of the files, numbers as numbers."""
 
     directory: Path
     manifest: Mapping[str, Any]
     runs: list[dict[str, Any]]
     views: list[dict[str, Any]]
+    timings: list[dict[str, Any]] = field(default_factory=list)
 
     @cached_property
     def methods(self) -> list[str]:
@@ -96,6 +103,15 @@ class Results:
 
     def interval(self, method: str, key: str) -> tuple[float, float]:
         """95% bootstrap interval over test images of a per-image metric; NaN below two images."""
+        if (method, key) not in self._intervals:
+            self._intervals[method, key] = self._bootstrap(method, key)
+        return self._intervals[method, key]
+
+    @cached_property
+    def _intervals(self) -> dict[tuple[str, str], tuple[float, float]]:
+        return {}
+
+    def _bootstrap(self, method: str, key: str) -> tuple[float, float]:
         values = self.per_view(method, key) if QUANTITIES[key].per_image else np.zeros(0)
         if len(values) < 2:
             return math.nan, math.nan
@@ -104,6 +120,27 @@ class Results:
             rng=np.random.default_rng(0),
         ).confidence_interval  # fmt: skip
         return float(found.low), float(found.high)
+
+    @cached_property
+    def devices(self) -> list[str]:
+        """Those that the methods were timed on, the tables' first."""
+        known = {_training(run) for run in self.runs}
+        timed = [row["device"] for row in self.timings if _training(row) in known]
+        return list(dict.fromkeys([self.manifest.get("device", ""), *timed]))
+
+    def on(self, device: str) -> Results:
+        """The same with the times measured on one of `devices`; a run that was not timed there has none."""
+        if device == self.devices[0]:
+            return self
+        rows = {_training(row): row for row in self.timings if row["device"] == device}
+        runs = [
+            {key: value for key, value in run.items() if key not in TIMES}
+            | {key: value for key, value in rows.get(_training(run), {}).items() if key in TIMES}
+            for run in self.runs
+        ]
+        commit = next(row["commit"] for row in rows.values())
+        manifest = {**self.manifest, "device": device, "commit": commit, "uncommitted_changes": False}
+        return dataclasses.replace(self, manifest=manifest, runs=runs, timings=[])
 
     def images(self, name: str) -> dict[str, np.ndarray] | None:
         """The arrays of images/`name`.npz: a method, "reference", "noisy" or "gbuffer"; None where there is none."""
@@ -123,12 +160,13 @@ def load(directory: str | Path) -> Results:
     directory = Path(directory)
     try:
         manifest = json.loads((directory / MANIFEST).read_text())
-        runs, views = (_read_rows(directory / name) for name in (RUNS, VIEWS))
+        runs, views = (read_rows(directory / name) for name in (RUNS, VIEWS))
+        timings = read_rows(directory / TIMINGS) if (directory / TIMINGS).exists() else []
     except FileNotFoundError as error:
         raise UserError(f"{error.filename}: missing; `nlt compare` writes it, in the directory of its --out") from None
     except ValueError as error:
         raise UserError(f"{directory / MANIFEST}: damaged ({error}); run `nlt compare` again") from None
-    return Results(directory, manifest, runs, views)
+    return Results(directory, manifest, runs, views, timings)
 
 
 def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -142,7 +180,30 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     write_bytes(path, text.getvalue().encode())
 
 
-def _read_rows(path: Path) -> list[dict[str, Any]]:
+def write_timings(directory: Path, manifest: Mapping[str, Any], runs: list[dict[str, Any]]) -> None:
+    """timings.csv: of these runs on the manifest's device, and what it has of the same dataset on others."""
+    path, told = directory / TIMINGS, {key: manifest[key] for key in ("device", "dataset", "commit")}
+    others = [
+        row
+        for row in (read_rows(path) if path.exists() else [])
+        if row["device"] != told["device"] and row["dataset"] == told["dataset"]
+    ]
+    own = [
+        {**{key: run.get(key) for key in ("method", "seed", "run")}, **told, **{k: run[k] for k in TIMES if k in run}}
+        for run in runs
+        if run["status"] == OK
+    ]
+    write_rows(path, own + others)
+
+
+def _training(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a run or its times are of: method, seed and, where it was trained, the training's directory."""
+    run = row.get("run")
+    return (row["method"], str(row["seed"]), run if isinstance(run, str) else "")
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a CSV, numbers as numbers, NaN where a cell is empty."""
     with path.open(newline="") as file:
         return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from nlt.data.files import write_bytes
@@ -28,6 +30,8 @@ class Table:
     note: str
     columns: list[str]
     rows: list[list[str]]
+    # Of each column: its quantity, and the results that it is from. Empty for a table that is not of quantities.
+    sources: list[tuple[str, Results]] = field(default_factory=list)
 
 
 def text(key: str, value: float | None) -> str:
@@ -47,7 +51,7 @@ def heading(key: str) -> str:
 
 
 def tables(results: Results) -> list[Table]:
-    """Every table of a comparison: the paper's columns, other metrics, sizes, stages, intervals."""
+    """Every table of a comparison: the paper's columns, other metrics, sizes, stages, intervals; times by device."""
     table = results.manifest["table"]
     seeds = len(results.manifest["seeds"])
     note = f"N = {results.manifest['n_test']} test views; " + (
@@ -58,36 +62,32 @@ def tables(results: Results) -> list[Table]:
             f" After the slash the paper's figures ({paper()[table]['scale']}, a GPU). Another scale and other scenes: "
             "compare the order of the methods, not the numbers."
         )
+    teachers = [f"{teacher} in {s}" for s, teacher in results.manifest.get("teachers", {}).items() if teacher != "path"]
+    if teachers:
+        note += f" Path tracing rows, OIDN's and denoising's input: traced by {', '.join(teachers)}."
     stages = tuple(f"{stage}_s" for stage in STAGES if any(_measured(results, f"{stage}_s")))
     bounds = [key for key in ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1") if _measured(results, key)]
-    return [
-        _table(results, paper()[table]["title"] if table else "Comparison", note, COLUMNS, table),
-        _table(results, "Further metrics", "", _MORE),
-        _table(results, "Sizes", "FLOPs and memory are the network's, the renderer's not included.", _SIZES),
-        _table(results, "Time per stage", "Medians.", (*stages, "time_per_frame_p95_s")),
-        Table(
-            "95% bootstrap intervals over test views",
-            "",
-            [heading(key) for key in bounds],
-            [
-                [_name(results, m), *(" to ".join(text(k, v) for v in results.interval(m, k)) for k in bounds)]
-                for m in results.methods
-            ],
-        ),
+    interval = lambda _, method, key: " to ".join(text(key, bound) for bound in results.interval(method, key))
+    here = lambda keys: [(key, results) for key in keys]
+    found = [
+        _table(results, paper()[table]["title"] if table else "Comparison", note, here(COLUMNS), table=table),
+        _table(results, "Further metrics", "", here(_MORE)),
+        _table(results, "Sizes", "FLOPs and memory are the network's, the renderer's not included.", here(_SIZES)),
+        _table(results, "Time per stage", "Medians.", here((*stages, "time_per_frame_p95_s"))),
+        _table(results, "95% bootstrap intervals over test views", "", here(bounds), interval),
     ]
+    if len(results.devices) > 1:
+        on_each = [("time_per_frame_s", results.on(device)) for device in results.devices]
+        names = ", ".join(f"({k}) {device}" for k, device in enumerate(results.devices, 1))
+        note = f"{names}. The other tables are of the first."
+        by_device = _table(results, "Time per frame by device", note, on_each)
+        columns = [f"{column}, ({k})" for k, column in enumerate(by_device.columns, 1)]
+        found.append(dataclasses.replace(by_device, columns=columns))
+    return found
 
 
 def _measured(results: Results, key: str) -> list[str]:
     return [method for method in results.methods if len(results.values(method, key))]
-
-
-def _table(results: Results, title: str, note: str, keys: tuple[str, ...], table: str | None = None) -> Table:
-    rows = []
-    for method in results.methods:
-        theirs = published(table, method)
-        cells = [_cell(results, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key in keys]
-        rows.append([_name(results, method), *cells])
-    return Table(title, note, [heading(key) for key in keys], rows)
 
 
 def _name(results: Results, method: str) -> str:
@@ -100,12 +100,33 @@ def _cell(results: Results, method: str, key: str) -> str:
     return text(key, results.mean(method, key)) + (f" ± {text(key, std)}" if math.isfinite(std) else "")
 
 
+def _table(
+    results: Results,
+    title: str,
+    note: str,
+    sources: list[tuple[str, Results]],
+    cell: Callable[[Results, str, str], str] = _cell,
+    table: str | None = None,
+) -> Table:
+    rows = []
+    for method in results.methods:
+        theirs = published(table, method)
+        cells = [cell(of, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key, of in sources]
+        rows.append([_name(results, method), *cells])
+    return Table(title, note, [heading(key) for key, _ in sources], rows, sources)
+
+
 def write_tables(results: Results) -> None:
     """table.csv with every number unrounded, table.md and table.tex."""
     found = tables(results)
     write_rows(results.directory / "table.csv", [_summary(results, method) for method in results.methods])
-    write_bytes(results.directory / "table.md", _markdown(found).encode())
-    write_bytes(results.directory / "table.tex", _latex(found).encode())
+    write_texts(results, "table", found)
+
+
+def write_texts(results: Results, name: str, found: list[Table], source: str = "runs.csv, views.csv") -> None:
+    """Tables as `name`.md and `name`.tex. `source`: the files that the numbers come from."""
+    write_bytes(results.directory / f"{name}.md", _markdown(found, source).encode())
+    write_bytes(results.directory / f"{name}.tex", _latex(found).encode())
 
 
 def _summary(results: Results, method: str) -> dict[str, Any]:
@@ -123,7 +144,7 @@ def _summary(results: Results, method: str) -> dict[str, Any]:
     return row
 
 
-def _markdown(found: list[Table]) -> str:
+def _markdown(found: list[Table], source: str) -> str:
     lines = []
     for number, table in enumerate(found, 1):
         lines += [f"{'#' * min(number, 2)} {table.title}", ""]
@@ -132,7 +153,7 @@ def _markdown(found: list[Table]) -> str:
         lines += [f"| method | {' | '.join(table.columns)} |", "|---|" + "---:|" * len(table.columns)]
         lines += [f"| {' | '.join(row)} |" for row in table.rows]
         lines.append("")
-    return "\n".join([*lines, "Where the numbers come from: manifest.json, runs.csv, views.csv."]) + "\n"
+    return "\n".join([*lines, f"Where the numbers come from: manifest.json, {source}."]) + "\n"
 
 
 _LATEX = {

@@ -45,11 +45,10 @@ def train(comparison: Comparison, method: str, seed: int, root: Path) -> tuple[P
     """
     files = comparison.configs(method)
     merged = read_configs(files)
-    precision = training.trainer_defaults()["precision"]
-    decides = {key: merged.get(key) for key in ("data", "model")} | {"seed": seed}
-    decides["trainer"] = {"precision": precision, **merged.get("trainer", {})}
-    key = hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
-    run = root / f"{method}-{key}"
+    # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
+    precisions = dict.fromkeys((training.trainer_defaults()["precision"], *training.PRECISIONS))
+    runs = [root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions]
+    run = next((run for run in runs if (run / "done.json").exists()), runs[0])
     done = run / "done.json"
     if not (done.exists() and ("diverged" in done.read_text() or newest_checkpoint(run))):
         try:
@@ -69,6 +68,12 @@ def train(comparison: Comparison, method: str, seed: int, root: Path) -> tuple[P
     checkpoint = newest_checkpoint(run)
     assert checkpoint is not None
     return checkpoint, took
+
+
+def _key(config: dict[str, Any], seed: int, precision: str) -> str:
+    decides = {key: config.get(key) for key in ("data", "model")} | {"seed": seed}
+    decides["trainer"] = {"precision": precision, **config.get("trainer", {})}
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _fit(run: Path, files: list[str], seed: int) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Renderer:
 
     def __init__(self, scene: Scene, teacher: str = "scene") -> None:
         self.scene = scene
-        self.teacher = _available(scene.description.teacher if teacher == "scene" else teacher, teacher == "scene")
+        self.teacher = choose_teacher(scene.description.teacher, teacher)
         # Infinite depth with Russian roulette: a bound on the depth would bias the teacher.
         self.integrator = mi.load_dict(
             {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
@@ -254,8 +254,16 @@ def _photons(scene: Any, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2
     return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid() & crosses
 
 
-def _available(teacher: str, replaceable: bool) -> str:
-    """The teacher that this variant runs: `teacher`, or `path` in its place."""
+def choose_teacher(own: str, wanted: str = "scene") -> str:
+    """The integrator of a scene whose description names `own`: "path" or "bdpt".
+
+    Args:
+        wanted: one of these; "scene": `own`, and `path` in its place where Mitsuba's variant cannot run it.
+
+    Raises:
+        UserError: the variant cannot run the one that is wanted.
+    """
+    teacher = own if wanted == "scene" else wanted
     if teacher == "path":
         return teacher
     if is_jit():
@@ -263,7 +271,7 @@ def _available(teacher: str, replaceable: bool) -> str:
         import nlt.rendering.bdpt  # noqa: F401
 
         return teacher
-    if not replaceable:
+    if wanted != "scene":
         raise UserError("teacher: bdpt needs Mitsuba's llvm or cuda; install LLVM, or use teacher: path")
     log.warning("teacher: bdpt needs Mitsuba's llvm or cuda; using path, which has the same expectation")
     return "path"

@@ -37,7 +37,47 @@ for (const heading of document.querySelectorAll("th[data-direction]")) {
   });
 }
 
+// ---- where a number comes from; by keyboard, as the ARIA authoring practices have it for grids ----
+
+const said = (element) => element.dataset.origin ?? "";
+
+function originOf(cell) {
+  const row = cell.parentElement, table = cell.closest("table"), column = table.tHead.rows[0].cells[cell.cellIndex];
+  if (row.parentElement === table.tHead) return said(cell);
+  const what = [row.cells[0].textContent, cell.cellIndex ? `${column.textContent}: ${cell.textContent}` : ""];
+  return [what.filter(Boolean).join(", "), said(cell), said(column), said(row), said(table)].filter(Boolean).join("\n");
+}
+
+const tell = (event) => {
+  const cell = event.target.closest?.("table.grid th, table.grid td");
+  $("origin").textContent = cell && ["focusin", "mouseover"].includes(event.type) ? originOf(cell) : "";
+};
+for (const type of ["mouseover", "mouseout", "focusin", "focusout"]) document.addEventListener(type, tell);
+
+const inGrid = (cell) => cell.querySelector("button") ?? cell; // a heading's focus is its button's
+for (const table of document.querySelectorAll("table.grid")) {
+  table.setAttribute("role", "grid");
+  for (const row of table.rows) for (const cell of row.cells) inGrid(cell).tabIndex = -1;
+  inGrid(table.rows[0].cells[0]).tabIndex = 0; // Tab enters at one cell, the one it left last
+  table.addEventListener("focusin", (event) => {
+    table.querySelector("[tabindex='0']").tabIndex = -1;
+    event.target.tabIndex = 0;
+  });
+  table.addEventListener("keydown", (event) => {
+    const { cellIndex: x, parentElement: row } = event.target.closest("th, td");
+    const [right, down] = [row.cells.length - 1, table.rows.length - 1], y = row.rowIndex;
+    const to = { ArrowLeft: [x - 1, y], ArrowRight: [x + 1, y], ArrowUp: [x, y - 1], ArrowDown: [x, y + 1],
+      Home: [0, event.ctrlKey ? 0 : y], End: [right, event.ctrlKey ? down : y] }[event.key];
+    if (!to || event.altKey || event.metaKey || event.shiftKey) return;
+    event.preventDefault();
+    inGrid(table.rows[clamp(to[1], 0, down)].cells[clamp(to[0], 0, right)]).focus();
+  });
+}
+
 // ---- speed and accuracy ----
+
+let device = 0; // an index of data.devices
+const valuesOf = (method) => ({ ...method.values, ...method.times[device] });
 
 const MARKERS = [
   "M-5,0a5,5 0 1,0 10,0a5,5 0 1,0 -10,0Z", "M-4.5,-4.5h9v9h-9Z", "M0,-6L6,0L0,6L-6,0Z", "M0,-6L5.5,4.5H-5.5Z",
@@ -119,11 +159,11 @@ function drawChart() {
     return;
   }
   const [xQ, yQ] = [data.quantities[xKey], data.quantities[yKey]];
-  const has = (method) => xKey in method.values && yKey in method.values && method.values[xKey][0] > 0;
+  const has = (method) => yKey in valuesOf(method) && valuesOf(method)[xKey]?.[0] > 0;
   const points = data.methods.filter(has).map((method) => {
-    const [y, low, high, text] = method.values[yKey];
+    const [y, low, high, text] = valuesOf(method)[yKey];
     const [s, c] = [yQ.scale, xQ.scale];
-    return { method, x: c * method.values[xKey][0], y: s * y, low: s * low, high: s * high, text };
+    return { method, x: c * valuesOf(method)[xKey][0], y: s * y, low: s * low, high: s * high, text };
   });
   const absent = data.methods.filter((method) => !has(method));
   const W = Math.max(300, place.clientWidth), H = clamp(W * 0.5, 330, 480);
@@ -137,7 +177,8 @@ function drawChart() {
     place.innerHTML = '<p class="note">No method has both.</p>';
     return;
   }
-  const [x0, x1] = spread(points.map((p) => p.x), true);
+  const onOthers = data.methods.flatMap((method) => method.times.map((times) => times[xKey]?.[0] * xQ.scale));
+  const [x0, x1] = spread([...points.map((p) => p.x), ...onOthers.filter((x) => x > 0)], true); // one for all devices
   const yLog = yQ.unit === "1" && Math.min(...points.map((p) => p.low)) > 0
     && Math.max(...points.map((p) => p.high)) / Math.min(...points.map((p) => p.low)) > 20;
   const [y0, y1] = spread(points.flatMap((p) => [p.low, p.high]), yLog);
@@ -213,16 +254,20 @@ for (const [enter, leave] of [["mouseover", "mouseout"], ["focusin", "focusout"]
   $("chart").addEventListener(enter, (event) => tip(event, event.target.closest("[data-tip]")?.dataset.tip));
   $("chart").addEventListener(leave, (event) => tip(event, ""));
 }
-document.addEventListener("keydown", (event) => event.key === "Escape" && tip(event, ""));
+document.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape") return;
+  tip(event, "");
+  $("origin").textContent = "";
+});
 
 function drawStages() {
-  const time = (method) => method.values.time_per_frame_s?.[0] ?? 0;
+  const time = (method) => valuesOf(method).time_per_frame_s?.[0] ?? 0;
   const most = Math.max(...data.methods.map(time));
-  const stages = data.stages.filter((stage) => data.methods.some((method) => method.values[`${stage}_s`]));
+  const stages = data.stages.filter((stage) => data.methods.some((method) => valuesOf(method)[`${stage}_s`]));
   const colour = (stage) => `var(--c${stages.indexOf(stage) % 7})`;
   const rows = data.methods.filter(time).map((method) => {
-    const segments = stages.filter((stage) => method.values[`${stage}_s`]).map((stage) => {
-      const [seconds, , , text] = method.values[`${stage}_s`];
+    const segments = stages.filter((stage) => valuesOf(method)[`${stage}_s`]).map((stage) => {
+      const [seconds, , , text] = valuesOf(method)[`${stage}_s`];
       return `<i style="width:${(100 * seconds) / time(method)}%;background:${colour(stage)}" title="${stage.replace("_", " ")}: ${text} ms"></i>`;
     });
     return `<span role="listitem"><span>${escapeText(method.label)}</span><span class="row"><span class="segments" style="width:${(72 * time(method)) / most}%">${segments.join("")}</span><span class="total">${(1e3 * time(method)).toFixed(1)} ms</span></span></span>`;
@@ -586,6 +631,13 @@ fill($("chart-y"), withRole("metric").map((key) => [key, data.quantities[key].he
 fill($("chart-x"), withRole("cost").map((key) => [key, axisTitle(key)]));
 if (data.quantities.mssim) $("chart-y").value = "mssim";
 for (const id of ["chart-x", "chart-y"]) $(id).addEventListener("change", drawChart);
+fill($("device"), [...data.devices.entries()]);
+$("chart-device").hidden = data.devices.length < 2;
+$("device").addEventListener("change", () => {
+  device = Number($("device").value);
+  drawChart();
+  drawStages();
+});
 drawChart();
 drawStages();
 if (data.views.length) startViewer();
