@@ -70,7 +70,9 @@ for (const table of document.querySelectorAll("table.grid")) {
       Home: [0, event.ctrlKey ? 0 : y], End: [right, event.ctrlKey ? down : y] }[event.key];
     if (!to || event.altKey || event.metaKey || event.shiftKey) return;
     event.preventDefault();
-    inGrid(table.rows[clamp(to[1], 0, down)].cells[clamp(to[0], 0, right)]).focus();
+    const cell = table.rows[clamp(to[1], 0, down)].cells[clamp(to[0], 0, right)];
+    inGrid(cell).focus();
+    cell.scrollIntoView({ block: "nearest", inline: "center" }); // from under the row's heading, which stays
   });
 }
 
