@@ -70,8 +70,8 @@ def make_results(directory, rows, table, seeds=1, over_seeds=0.0, over_views=1e-
         write_images(directory, "reference", radiance=smooth, exposure=exposure, view=view)
         write_images(directory, "noisy", radiance=smooth * rng.exponential(size=smooth.shape))
         albedo = rng.random(smooth.shape)
-        buffers = {"albedo": albedo, "normal": albedo - 0.5, "depth": albedo[:, :1], "light_in_view": view > 1}
-        write_images(directory, "gbuffer", **buffers)
+        buffers = {"albedo": albedo, "normal": albedo - 0.5, "depth": albedo[:, :1], "transmits": albedo[:, 0] > 0.5}
+        write_images(directory, "gbuffer", **buffers, light_in_view=view > 1)
         for k, method in enumerate(rows):
             write_images(directory, method, radiance=smooth * (1 + 0.05 * k * rng.standard_normal(smooth.shape)))
         assert (directory / IMAGES / "reference.npz").exists()

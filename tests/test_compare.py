@@ -520,6 +520,9 @@ def test_causes_of_failures(tmp_path):
     depth = np.full((2, 1, 40, 40), 4.0)
     light = np.full((2, 3, 40, 40), 0.4)
     albedo[:, :, 2:8, 2:8] = 0  # mirror
+    albedo[:, :, 12:14, 2:8] = 0  # glass
+    transmits = np.zeros((2, 40, 40), bool)
+    transmits[:, 12:14, 2:8] = True
     depth[:, :, 30:38, 2:8] = 1.0  # near
     light[:, :, :, 20:] = 0.1  # shadow
     make_results(tmp_path, {"cnn": {"mse": 0.1}}, "table2", images=True)
@@ -527,14 +530,16 @@ def test_causes_of_failures(tmp_path):
     write_images(tmp_path, "reference", radiance=light, exposure=np.ones(2, np.float32), view=view)
     write_images(tmp_path, "noisy", radiance=light)
     normal = np.zeros_like(albedo)
-    write_images(tmp_path, "gbuffer", albedo=albedo, normal=normal, depth=depth, light_in_view=np.array([True, False]))
+    buffers = {"albedo": albedo, "normal": normal, "depth": depth, "transmits": transmits}
+    write_images(tmp_path, "gbuffer", **buffers, light_in_view=np.array([True, False]))
     wrong = light.copy()
     wrong[0, :, 3:7, 3:7] += 0.3  # in the mirror of the first view
     wrong[1, :, 10:28, 30:38] += 0.3  # anywhere in the second
     write_images(tmp_path, "cnn", radiance=wrong)
     images = Shown.load(load(tmp_path))
     causes = images.causes
-    assert np.array_equal(causes["mirror or glass"], (albedo == 0).any(1))
+    assert np.array_equal(causes["mirror"], (albedo == 0).any(1) & ~transmits)
+    assert np.array_equal(causes["glass"], transmits)
     assert np.array_equal(causes["near camera"], depth[:, 0] == 1)
     edge = causes["shadow edge"]
     assert edge[:, 10:28, 19:21].all() and not edge[:, :, :17].any() and not edge[:, :, 23:].any()
@@ -545,9 +550,9 @@ def test_causes_of_failures(tmp_path):
     draw(tmp_path)
     with (tmp_path / "failures.csv").open(newline="") as file:
         share = {row["cause"]: float(row["share_of_worst"]) for row in csv.DictReader(file)}
-    assert share["mirror or glass"] == pytest.approx(0.1) and share["light not in view"] == pytest.approx(0.9)
+    assert share["mirror"] == pytest.approx(0.1) and share["light not in view"] == pytest.approx(0.9)
     assert (
-        "| CNN only | 10.0% (16) | 0.0% (0) | 0.0% (0) | 90.0% (144) | 0.0% (0) |"
+        "| CNN only | 10.0% (16) | 0.0% (0) | 0.0% (0) | 0.0% (0) | 90.0% (144) | 0.0% (0) |"
         in (tmp_path / "failures.md").read_text()
     )
 

@@ -17,6 +17,7 @@ from nlt.errors import UserError
 from nlt.rendering import renderer as renderer_module
 from nlt.rendering import variant as variant_module
 from nlt.rendering.renderer import Renderer
+from nlt.scenes import builtin
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import MOVING_LIGHT, load_description
@@ -25,6 +26,7 @@ from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
 
 # What mi.render's moments are in.
 XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+GLASS = ("dielectric", "thindielectric", "roughdielectric")
 ALPHA = 1e-4  # of each test, after Bonferroni's correction
 
 
@@ -272,6 +274,7 @@ def test_gbuffer(experiment, demo):
         rotation = camera.world_to_view[:3, :3].astype(float)
         z, hit, weights = first_hit(triangles, np.tile(camera.position, (len(pixels), 1)), view @ rotation)
         buffer = {name: a.reshape(len(a), -1).T for name, a in renderer.gbuffer(camera).items()}
+        transmits = renderer.transmits(camera).ravel()
         light = (buffer["depth"][:, 0] < z - 1e-3) & (np.abs(buffer["albedo"]) < 1e-6).all(1)
         if experiment == "moving_lights":  # whose rectangle is no mesh
             z[light] = buffer["depth"][light, 0]
@@ -292,6 +295,7 @@ def test_gbuffer(experiment, demo):
                 normal = np.cross(b - a, c - a)
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             assert np.abs(buffer["normal"][mine] - normal).max() < 2e-3, name
+            assert (transmits[mine] == (shape.bsdf["type"] in GLASS)).all(), name
             colour = shape.bsdf.get("bsdf", {}).get("reflectance", {})
             if shape.bsdf["type"] in ("dielectric", "conductor", "roughconductor"):
                 assert (buffer["albedo"][mine] == 0).all()
@@ -302,6 +306,19 @@ def test_gbuffer(experiment, demo):
         assert buffer["albedo"].min() >= 0 and buffer["albedo"].max() <= 1
         # Depth is not distance: seen obliquely, the two differ.
         assert (np.linalg.norm(view, axis=1) * z - z).max() > 0.1
+
+
+def test_glass_transmits():
+    """The glass egg transmits where rays first meet a mesh of glass, float64, and nothing else in view does."""
+    renderer, shapes = Renderer(Scene(load_description("egg"), "static")), builtin.egg().values()
+    (glass,) = (shape.mesh.vertices for shape in shapes if shape.bsdf["type"] in GLASS)
+    camera = Camera.look_at(glass.max(0) + np.array([0.5, 0.1, 0.5]), glass.mean(0), np.array([0, 1.0, 0]), 30, 16, 12)
+    triangles = np.concatenate([shape.mesh.vertices[shape.mesh.faces] for shape in shapes])
+    of_glass = np.concatenate([[shape.bsdf["type"] in GLASS] * len(shape.mesh.faces) for shape in shapes])
+    _, hit, _ = first_hit(triangles, np.tile(camera.position, (192, 1)), camera.directions(camera.centres()))
+    transmits = renderer.transmits(camera).ravel()
+    assert 0.1 < of_glass[hit].mean() < 0.9
+    assert (transmits != of_glass[hit]).sum() <= 2  # rays that graze the egg
 
 
 def test_misses(tmp_path):

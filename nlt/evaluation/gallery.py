@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from nlt.errors import UserError
 from nlt.evaluation.figures import grid, save, shown
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
@@ -23,7 +24,8 @@ _INSET = 4  # a side of the image over a side of the inset
 WORST = 0.1  # of a method's pixels
 # What the supplementary names as hard, in the order in which a pixel is put down to one: colours of Okabe and Ito.
 CAUSES = {
-    "mirror or glass": "#0072B2",
+    "mirror": "#0072B2",
+    "glass": "#56B4E9",
     "near camera": "#E69F00",
     "shadow edge": "#D55E00",
     "light not in view": "#CC79A7",
@@ -70,15 +72,19 @@ class Shown:
         """For each of `CAUSES` the pixels (V, H, W) that it applies to; several may apply to one."""
         buffers = self.results.images("gbuffer")
         assert buffers is not None
+        if "transmits" not in buffers:
+            raise UserError(f"{self.results.directory}: images of an older version; run nlt compare again")
         buffers = {name: array.astype(np.float32) for name, array in buffers.items()}
         albedo, normal, depth = buffers["albedo"].mean(1), buffers["normal"], buffers["depth"][:, 0]
         hit = depth > 0
         luminance = self.reference.mean(-1)
         near = hit & (depth < 0.5 * np.median(depth[hit])) if hit.any() else hit
-        mirror = hit & (albedo == 0) & (luminance < 1)  # a lamp has no albedo either
+        specular = hit & (albedo == 0) & (luminance < 1)  # a lamp has no albedo either
+        glass = buffers["transmits"].astype(bool)
         dark = ~buffers["light_in_view"].astype(bool)
         causes = {
-            "mirror or glass": mirror,
+            "mirror": specular & ~glass,
+            "glass": specular & glass,
             "near camera": near,
             "shadow edge": _shadow_edges(luminance, albedo, normal, depth),
             "light not in view": np.broadcast_to(dark[:, None, None], hit.shape),

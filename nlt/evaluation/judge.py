@@ -46,7 +46,10 @@ class Evaluation:
         write_images(directory, "reference", radiance=reference, exposure=stack["exposure"], view=view)
         write_images(directory, "noisy", radiance=stack["noisy"])
         buffers = {name: stack[name] for name in ("albedo", "normal", "depth")}
-        write_images(directory, "gbuffer", **buffers, light_in_view=self._light_in_view(samples))
+        placed = (self.frames.place(k) for k in self.shown)
+        transmits = np.stack([renderer.transmits(camera) for renderer, camera in placed])
+        lit = self._light_in_view(samples)
+        write_images(directory, "gbuffer", **buffers, transmits=transmits, light_in_view=lit)
 
     @staticmethod
     def _light_in_view(samples: list[Batch]) -> np.ndarray:

@@ -14,7 +14,8 @@ results/NAME/ holds
   are those of the test set without the view's jackknife group: they carry these metrics' uncertainty;
 - `images/METHOD.npz`, not in git: `radiance` (V, 3, H, W), float16, linear, of the first seed, for the shown views.
   `images/reference.npz` also has `exposure` (V,) and `view` (V,); `images/noisy.npz` is the teaching input, and
-  `images/gbuffer.npz` has `albedo` and `normal` (V, 3, H, W), `depth` (V, 1, H, W), `light_in_view` (V,) bool.
+  `images/gbuffer.npz` has `albedo` and `normal` (V, 3, H, W), `depth` (V, 1, H, W), `transmits` (V, H, W)
+  bool, `light_in_view` (V,) bool.
 
 Tables, figures and claims (report.py) are made from these alone.
 """

@@ -48,6 +48,7 @@ class Renderer:
         self.emitters = list(scene.mi_scene.emitters())
         self._radiance = freeze(_radiance if self.teacher == "path" else _bidirectional)
         self._gbuffer = freeze(_gbuffer)
+        self._transmits = freeze(_transmits)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
         room = scene.description.room
@@ -136,6 +137,12 @@ class Renderer:
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
         image = lambda a: np.where(valid[:, None], a, 0).T.reshape(-1, camera.height, camera.width)
         return {"depth": image(depth[:, None]).astype(np.float32), "normal": image(normal), "albedo": image(albedo)}
+
+    def transmits(self, camera: Camera) -> np.ndarray:
+        """(H, W) bool: the surface at the pixel's centre lets light through, as glass does."""
+        lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
+        (transmits,) = launch(self._transmits, lanes, **self._camera_values(camera))
+        return transmits.reshape(camera.height, camera.width)
 
     def photons(self, count: int, seed: int) -> dict[str, np.ndarray]:
         """Photons that arrive in the room, from all emitters in proportion to the power that arrives from each.
@@ -243,6 +250,13 @@ def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
     valid = interaction.is_valid()
     albedo = diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
     return interaction.p, interaction.sh_frame.n, albedo, valid
+
+
+def _transmits(scene: Any, position: Any, **camera: Any) -> tuple:
+    interaction = scene.ray_intersect(_ray(position, **camera))
+    valid = interaction.is_valid()
+    flags = interaction.bsdf().flags() if _any(valid) else mi.UInt32(0)
+    return (valid & mi.has_flag(flags, mi.BSDFFlags.Transmission),)
 
 
 def _photons(scene: Any, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2: Any) -> tuple:
