@@ -4,8 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import plain_scene, write_room
-from scipy import stats
+from scipy import ndimage, stats
+from torch.utils.data import default_collate
 
+from nlt.baselines.photon_splat import PhotonSplat
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
 from nlt.paths import scenes_root
@@ -69,18 +71,56 @@ def test_irradiance(tmp_path, case):
         assert compatible(np.array(ours), irradiancemeter(tmp_path, patch, 2)) < 1e-6, "nor direct from indirect"
 
 
+def test_photon_splat(tmp_path):
+    """The irradiance that photons give the pixels of a room is the one that Mitsuba's direct radiance comes from."""
+    description = load_description(str(write_room(tmp_path)))
+    scene = Scene(description, "fixed_lights")
+    renderer, camera = Renderer(scene), sample_view(description, 48, np.random.default_rng(1))
+    buffer = renderer.gbuffer(camera)
+    view = {**buffer, "camera_matrix": camera.matrix, "world_to_view": camera.world_to_view,
+            "view_direction": camera.view_directions()}  # fmt: skip
+    batch = default_collate([{**view, **renderer.photons(4000, seed)} for seed in range(40)])
+    batch = {name: value.float() if value.is_floating_point() else value for name, value in batch.items()}
+    (ours,) = PhotonSplat(width=1).irradiance(batch)
+    plain, albedo = mi.load_file(str(tmp_path / "scene.xml"), optimize=False), np.array([0.7, 0.6, 0.5])
+
+    def mitsubas(depth):
+        integrator = mi.load_dict({"type": "path", "max_depth": depth})
+        render = lambda k: mi.render(plain, sensor=sensor_of(camera), integrator=integrator, spp=16, seed=mi.UInt32(k))
+        images = np.stack([np.moveaxis(np.array(render(k)), 2, 0) for k in range(8)]).astype(float)
+        return images * np.pi / albedo[:, None, None]
+
+    # Where no pixel beside it sees another surface, and which is no lamp.
+    normal, emits = buffer["normal"], mitsubas(1).any((0, 1))
+    flat = ~ndimage.maximum_filter(emits, 3)
+    for channel in normal:
+        flat &= ndimage.maximum_filter(channel, 3) - ndimage.minimum_filter(channel, 3) < 1e-3
+    floor, walls = flat & (normal[1] > 0.9), flat & (np.abs(normal[1]) < 0.1)
+    assert floor.sum() > 100 and walls.sum() > 300
+    direct, bounced = mitsubas(2), mitsubas(3)
+    for pixels in (floor, walls):
+        region = lambda images, pixels=pixels: np.asarray(images)[..., pixels].mean(-1)
+        assert compatible(region(ours), region(direct)) > 1e-3
+        assert compatible(region(ours), region(bounced)) < 1e-6, "direct cannot be told from indirect"
+
+
 # ---- G-buffer -------------------------------------------------------------------------------------------
+
+
+def sensor_of(camera, units=1.0, **more):
+    """The camera, as Mitsuba's own."""
+    to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
+    to_world[:3, 3] *= units
+    return mi.load_dict({
+        "type": "perspective", "fov": camera.fov, "near_clip": 1e-3, "to_world": mi.ScalarTransform4f(to_world),
+        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
+        **more,
+    })  # fmt: skip
 
 
 def aovs(plain, camera, units):
     """Mitsuba's AOVs at the pixel centres: depth along the axis in metres, normal, albedo; each (..., H, W)."""
-    to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
-    to_world[:3, 3] *= units
-    sensor = mi.load_dict({
-        "type": "perspective", "fov": camera.fov, "near_clip": 1e-3, "to_world": mi.ScalarTransform4f(to_world),
-        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
-        "sampler": {"type": "stratified", "sample_count": 1, "jitter": False},
-    })  # fmt: skip
+    sensor = sensor_of(camera, units, sampler={"type": "stratified", "sample_count": 1, "jitter": False})
     integrator = mi.load_dict({"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo"})
     values = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=1)), 2, 0).astype(float)
     position, normal, albedo = np.split(values[-9:], 3)

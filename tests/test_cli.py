@@ -159,6 +159,7 @@ def test_scale_without_a_model(refused, tiny):
         ({"nope": 1}, ["comparison.yaml", "nope", "known are"]),
         ({"table": "table3"}, ["comparison.yaml", "table", "table1", "table3"]),
         ({"methods": ["nope"]}, ["comparison.yaml", "methods", "nope", "nlt_photons"]),
+        ({"methods": ["cnn@nope"]}, ["comparison.yaml", "methods", "nope", "tiny", "paper"]),
         ({"scale": "nope"}, ["nope.yaml", "No such file"]),
         ({"data": "nope"}, ["nope.yaml", "No such file"]),
         ({"scale": None}, ["comparison.yaml", "scale", "configs/scale"]),

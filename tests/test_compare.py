@@ -106,7 +106,6 @@ def world(tiny, tmp_path_factory, one_thread):
         patch.chdir(folder)
         patch.syspath_prepend(folder)
         patch.setattr(paths, "CONFIGS", folder / "configs")
-        patch.setattr(comparison, "CONFIGS", folder / "configs")
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
         patch.setattr(clock.Clock, "_frame", spy)

@@ -31,13 +31,13 @@ CONFIGS = [find_config("model", name) for name in config_names("model") if name 
 SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 
 
-def build(config: Path, scale: Path | None = None) -> RenderingModule:
+def build(config: Path, scale: Path | None = None, more: dict[str, int] = SIZE) -> RenderingModule:
     """As the command line does: the model's file, then overrides without class_path."""
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument("--config", action="config")
     parser.add_subclass_arguments(RenderingModule, "model")
     files = [f"--config={path}" for path in (config, scale) if path]
-    overrides = [f"--model.init_args.{name}={value}" for name, value in SIZE.items()]
+    overrides = [f"--model.init_args.{name}={value}" for name, value in more.items()]
     torch.manual_seed(0)
     return parser.instantiate_classes(parser.parse_args([*files, *overrides])).model
 
@@ -124,9 +124,10 @@ def test_doubled_exposure_of_halved_light(method):
     torch.testing.assert_close(method(batch), expected)
 
 
-def test_splitting_the_photons():
+@pytest.mark.parametrize("name", ["nlt_photons", "photon_splat", "leaner/photons"])
+def test_splitting_the_photons(name):
     """Each photon as two of half the flux: the same light, the same prediction."""
-    batch, method = synthetic_batch(), NeuralLightTransport(photons=True, **SIZE).eval()
+    batch, method = synthetic_batch(), build(find_config("model", name)).eval()
     expected = method(batch)
     for name in method.inputs:
         if name.startswith("photon_"):
@@ -159,6 +160,25 @@ def test_a_scale_without_class_path_is_merged(tmp_path):
     method = build(next(path for path in CONFIGS if path.stem == "nlt_photons"), scale)
     assert isinstance(method, NeuralLightTransport)
     assert method.hparams["depth"] == 1 and method.hparams["photons"]
+
+
+@pytest.mark.parametrize("name", ["cnn", "nlt_photons", "leaner/photons"])
+def test_sizes(name):
+    """From tiny to the paper's, which are the defaults; each has more parameters than the one before."""
+    made = {
+        s: build(find_config("model", name), find_config("size", s), {}) for s in config_names("size") if "_" not in s
+    }
+    count = {size: sum(p.numel() for p in method.parameters()) for size, method in made.items()}
+    assert sorted(count, key=lambda size: count[size]) == ["tiny", "small", "medium", "large", "paper"]
+    paper = build(find_config("model", name), None, {})
+    assert paper.hparams == made["paper"].hparams
+    points, photons = (hasattr(paper, part) for part in ("pointnet", "photon_network"))
+    assert (points, photons) == {"cnn": (False, False), "nlt_photons": (True, True)}.get(name, (False, True))
+
+
+def test_width_of_the_points_is_even():
+    with pytest.raises(UserError, match=r"model\.init_args\.point_width: must be even, is 7"):
+        NeuralLightTransport(point_width=7, **SIZE)
 
 
 # --- loss, trainer, checkpoints ---
@@ -245,6 +265,16 @@ def test_checkpoint_loads_with_weights_only(checkpoints):
         assert restored.eval()(batch).isfinite().all()
 
 
+def test_checkpoint_from_before_widths_could_be_chosen(tmp_path, checkpoints):
+    checkpoint, batch = torch.load(checkpoints["nlt_photons"], weights_only=True), synthetic_batch()
+    for name in ("points", "point_width", "photon_width"):
+        del checkpoint["architecture"][name], checkpoint["hyper_parameters"][name]
+    torch.save(checkpoint, tmp_path / "old.ckpt")
+    paths = (tmp_path / "old.ckpt", checkpoints["nlt_photons"])
+    old, new = (RenderingModule.load_from_checkpoint(path).eval() for path in paths)
+    assert torch.equal(old(batch), new(batch))
+
+
 @pytest.mark.parametrize(
     ("wanted", "options", "saved", "message"),
     [
@@ -264,6 +294,12 @@ def test_checkpoint_loads_with_weights_only(checkpoints):
             {"photons": True},
             "nlt",
             "checkpoint has photons=False, this model photons=True",
+        ),
+        (
+            NeuralLightTransport,
+            {"point_width": 8},
+            "nlt",
+            "checkpoint has point_width=64, this model point_width=8",
         ),
         (SparseDenoising, {"one_in": 16}, "denoising_1_4", "checkpoint has one_in=4, this model one_in=16"),
     ],

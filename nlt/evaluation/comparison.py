@@ -11,14 +11,14 @@ from nlt.errors import UserError
 from nlt.evaluation.paper import order, tables
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
-from nlt.paths import CONFIGS, config_names, find_config
+from nlt.paths import config_names, find_config
 
 _KEYS = ("table", "data", "scale", "methods", "seed")
 
 
 @dataclass
 class Comparison:
-    """What a config of configs/compare asks for."""
+    """What a config of configs/compare asks for; METHOD@SIZE is a method in a size of configs/size."""
 
     name: str
     data: Path
@@ -54,8 +54,12 @@ class Comparison:
         # Those in folders belong to a comparison that names them.
         wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
         for method in wanted:
-            if method not in known:
-                raise UserError(f"{file}: methods: no method {method!r} in configs/model; known are {', '.join(known)}")
+            name, _, size = method.partition("@")
+            sizes = config_names("size")
+            if name not in known:
+                raise UserError(f"{file}: methods: no method {name!r} in configs/model; known are {', '.join(known)}")
+            if "@" in method and size not in sizes:
+                raise UserError(f"{file}: methods: no size {size!r} in configs/size; known are {', '.join(sizes)}")
         return cls(
             name=file.stem,
             data=find_config("data", content["data"]),
@@ -71,12 +75,14 @@ class Comparison:
 
     def configs(self, method: str) -> list[str]:
         """The config files of a method's training, in order."""
-        return [str(self.data), str(CONFIGS / "model" / f"{method}.yaml"), str(self.scale)]
+        name, _, size = method.partition("@")
+        sizes = [find_config("size", size)] if size else []
+        return [str(path) for path in (self.data, find_config("model", name), self.scale, *sizes)]
 
 
 def untrained(method: str) -> Method | None:
     """The method, if its class is one that needs no training; None for one that does."""
-    file = CONFIGS / "model" / f"{method}.yaml"
+    file = find_config("model", method.partition("@")[0])
     model = read_configs([str(file)]).get("model", {})
     kind = pydoc.locate(str(model.get("class_path")))
     if not (isinstance(kind, type) and issubclass(kind, Method)) or issubclass(kind, RenderingModule):

@@ -26,6 +26,9 @@ PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
 GBUFFER_CHANNELS = 10
 
+# What checkpoints have that were written before it could be chosen.
+_FIXED = {"points": True, "point_width": 64, "photon_width": 64}
+
 
 def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
     """log(1 + exposure * radiance), of (B, ...) and (B,).
@@ -50,6 +53,8 @@ class RenderingModule(Method, L.LightningModule):
         self,
         width: int = 64,
         depth: int = 3,
+        point_width: int = 64,
+        photon_width: int = 64,
         loss: Literal["mse", "relative_mse"] = "mse",
         learning_rate: float = 5e-4,
         lr_decay: float = 0.99,
@@ -64,6 +69,8 @@ class RenderingModule(Method, L.LightningModule):
         Args:
             width: feature maps of the U-Net's first level.
             depth: number of times the U-Net halves the resolution.
+            point_width: features of a point, even; of methods with a PointNet.
+            photon_width: features of a photon; of methods with a photon network.
             loss: a function in nlt.models.losses.
             learning_rate: of Adam.
             lr_decay: factor to the learning rate after each epoch.
@@ -74,12 +81,15 @@ class RenderingModule(Method, L.LightningModule):
             seed: of what a method draws at random in training.
         """
         super().__init__()
-        for name, value, least in (("width", width, 1), ("depth", depth, 0)):
+        transport = (("point_width", point_width, 2), ("photon_width", photon_width, 1))
+        for name, value, least in (("width", width, 1), ("depth", depth, 0), *transport):
             if value < least:
                 raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
         for name, most in (("max_points", max_points), ("max_photons", max_photons)):
             if most is not None and most < 1:
                 raise UserError(f"model.init_args.{name}: must be at least 1, is {most}")
+        if point_width % 2:
+            raise UserError(f"model.init_args.point_width: must be even, is {point_width}")
         self.save_hyperparameters()
         self.hparams["num_points"] = min(num_points, max_points or num_points)  # the embeddings that it has
         self.loss = getattr(losses, loss)
@@ -207,7 +217,7 @@ class RenderingModule(Method, L.LightningModule):
         path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
-        saved = checkpoint["architecture"]
+        saved = _FIXED | checkpoint["architecture"]
         different = [name for name in self.architecture if saved[name] != self.hparams[name]]
         if different:
             raise UserError(

@@ -67,17 +67,22 @@ def _tangent_planes(camera_matrix: Tensor, world_to_view: Tensor, depth: Tensor,
     return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit: infinitely far
 
 
-def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """Mean of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W), 0 where none."""
+def total(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
+    """Sum of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W)."""
     batch, _, channels = features.shape
     rows = height * width + 1  # the last collects the points that are dropped
     # bfloat16 would stop counting at 256
     features = features.to(torch.promote_types(features.dtype, torch.float32))
     index = (pixels + rows * torch.arange(batch, device=pixels.device)[:, None]).flatten()
-    total = features.new_zeros(batch * rows, channels).index_add_(0, index, features.flatten(0, 1))
-    count = features.new_zeros(batch * rows).index_add_(0, index, features.new_ones(index.shape))
-    mean = (total / count.clamp(min=1)[:, None]).view(batch, rows, channels)[:, :-1]
-    return mean.view(batch, height, width, channels).permute(0, 3, 1, 2)
+    sums = features.new_zeros(batch * rows, channels).index_add_(0, index, features.flatten(0, 1))
+    kept = sums.view(batch, rows, channels)[:, :-1]
+    return kept.view(batch, height, width, channels).permute(0, 3, 1, 2)
+
+
+def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
+    """Mean of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W), 0 where none."""
+    count = total(torch.ones_like(features[..., :1], dtype=torch.float32), pixels, height, width)
+    return total(features, pixels, height, width) / count.clamp(min=1)
 
 
 def project(

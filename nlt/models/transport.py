@@ -54,10 +54,11 @@ class PointNet(nn.Module):
     concatenated with their maximum over the visible points.
     """
 
-    def __init__(self, in_features: int, features: int = 64, hidden: int = 32, depth: int = 2) -> None:
+    def __init__(self, in_features: int, features: int = 64, depth: int = 2) -> None:
         super().__init__()
         self.preprocess = nn.Linear(in_features, features)
-        self.blocks = nn.ModuleList(ResidualBlock(features, hidden, features // 2) for _ in range(depth))
+        half = features // 2
+        self.blocks = nn.ModuleList(ResidualBlock(features, half, half) for _ in range(depth))
 
     def forward(self, points: Tensor, visible: Tensor) -> Tensor:
         x = self.preprocess(points)
@@ -71,8 +72,8 @@ class PhotonNetwork(nn.Sequential):
     """Sec. "Implementation Details": a fully connected ResNet, each photon for itself: (B, P, in_features) ->
     (B, P, features)."""
 
-    def __init__(self, in_features: int, features: int = 64, hidden: int = 32, depth: int = 2) -> None:
+    def __init__(self, in_features: int, features: int = 64, depth: int = 2) -> None:
         super().__init__(
             nn.Linear(in_features, features),
-            *(ResidualBlock(features, hidden, features) for _ in range(depth)),
+            *(ResidualBlock(features, features // 2, features) for _ in range(depth)),
         )
