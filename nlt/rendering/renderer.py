@@ -255,7 +255,7 @@ def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
 def _transmits(scene: Any, position: Any, **camera: Any) -> tuple:
     interaction = scene.ray_intersect(_ray(position, **camera))
     valid = interaction.is_valid()
-    flags = interaction.bsdf().flags() if _any(valid) else mi.UInt32(0)
+    flags: Any = interaction.bsdf().flags() if _any(valid) else mi.UInt32(0)
     return (valid & mi.has_flag(flags, mi.BSDFFlags.Transmission),)
 
 
