@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from nlt import __version__
-from nlt.errors import UserError
+from nlt.errors import UserError, as_mistake
 
 _LIGHTNING = {
     "fit": "train a method",
@@ -27,9 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"nlt: error: {error}", file=sys.stderr)
         return 2
-    except OSError as error:  # no space, no permission: what is written stays
-        place = error.filename or "nlt"
-        print(f"nlt: error: {place}: {error.strerror or error}; set it right and run again", file=sys.stderr)
+    except OSError as error:
+        print(f"nlt: error: {as_mistake(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("nlt: interrupted; run the same command again to go on", file=sys.stderr)
@@ -53,14 +52,15 @@ def _run(arguments: list[str]) -> int:
         from nlt.data.generate import generate
         from nlt.data.spec import load_spec
 
-        slurm = dict(options.slurm)
-        print(generate(*load_spec(options.config), options.workers, options.scheduler, slurm))
+        print(generate(*load_spec(options.config), options.workers, options.scheduler, dict(options.slurm)))
     elif options.command == "data":
         _run_data(options)
     elif options.command == "compare":
         from nlt.evaluation.compare import compare
+        from nlt.evaluation.comparison import Comparison
 
-        compare(options.config, options.out, options.scale, options.data, options.methods, options.seeds)
+        comparison = Comparison.load(options.config, options.scale, options.data, options.methods, options.seeds)
+        compare(comparison, options.out, options.workers, options.scheduler, dict(options.slurm))
     elif options.command == "bench":
         _bench(options)
     elif options.command == "report":
@@ -129,13 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     generate = commands.add_parser("generate", help="render a dataset; resumes, and does nothing if it is complete")
     generate.add_argument("--config", action="append", required=True, help="YAML; later ones override earlier ones")
-    generate.add_argument("--workers", type=_positive, help="rendered side by side (default: as many as cores)")
-    generate.add_argument(
-        "--scheduler", default="local", help="local, slurm, or a Dask scheduler such as tcp://host:8786"
-    )
-    generate.add_argument(
-        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE", help="such as partition=gpu, time=60"
-    )
+    _add_scheduler(generate, "jobs side by side (default: a core each; as a cluster has threads; in a Slurm array, 64)")
     data = commands.add_parser("data", help="look at a dataset: show, verify, stats")
     _add_data(data)
     for name, text in _LIGHTNING.items():
@@ -143,11 +137,12 @@ def _parser() -> argparse.ArgumentParser:
         commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")
     compare = commands.add_parser("compare", help="a table of all methods: generates, trains, evaluates, times")
     compare.add_argument("--config", required=True, help="a config of configs/compare, by name or path")
-    compare.add_argument("--out", help="where the results go (default: results/NAME)")
+    compare.add_argument("--out", help="where the results go (default: results/NAME, or NAME-SCALE-DATA if given)")
     compare.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
+    _add_scheduler(compare, "trainings side by side (default: in turn; on a cluster as `nlt generate`)")
     _add_bench(commands.add_parser("bench", help="what a frame, a training step and a sample cost, stage by stage"))
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
@@ -163,6 +158,16 @@ def _parser() -> argparse.ArgumentParser:
     teachers.add_argument("--seed", type=int, default=0)
     _add_scenes(commands.add_parser("scenes", help="scenes: list, show, check, preview, add"))
     return parser
+
+
+def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
+    parser.add_argument("--workers", type=_positive, help=workers)
+    parser.add_argument(
+        "--scheduler", default="local", help="local, slurm, or a Dask scheduler such as tcp://host:8786"
+    )
+    parser.add_argument(
+        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE", help="such as partition=gpu, time=60"
+    )
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:

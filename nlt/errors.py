@@ -7,3 +7,8 @@ class UserError(Exception):
 
 class DivergedError(UserError):
     """A training whose loss, or a method whose prediction, is not finite."""
+
+
+def as_mistake(error: OSError) -> UserError:
+    """No space, no permission and the like: what is written stays."""
+    return UserError(f"{error.filename or 'nlt'}: {error.strerror or error}; set it right and run again")

@@ -6,7 +6,7 @@ import argparse
 import logging
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,33 +113,59 @@ def quiet() -> None:
         warnings.filterwarnings("ignore", pattern)
 
 
-def run_lightning(arguments: list[str]) -> NLTCLI:
+class _Parser(NLTCLI):
+    """Parses a config, and makes nothing of it."""
+
+    def _set_seed(self) -> None: ...
+
+    def _parse_ckpt_path(self) -> None: ...
+
+    def instantiate_classes(self) -> None: ...
+
+
+def check_configs(files: list[str]) -> None:
+    """Raises UserError if `nlt fit` would not take these configs: for a key or a type, before anything is made."""
+    arguments = ["fit", *(f"--config={file}" for file in files)]
+    _run(_Parser, arguments[1:], _sources(arguments), run=False)
+
+
+def run_lightning(arguments: list[str], callbacks: Sequence[L.Callback] = ()) -> NLTCLI:
     """Run a subcommand such as `fit --config ...` and return what it made.
 
     Raises:
         UserError: a config, a checkpoint or the dataset is wrong.
     """
+    return _run(NLTCLI, arguments, _sources(arguments), callbacks)
+
+
+def _run(
+    kind: type[NLTCLI],
+    arguments: list[str],
+    given: dict[str, str],
+    callbacks: Sequence[L.Callback] = (),
+    run: bool = True,
+) -> NLTCLI:
     quiet()
-    given = _check_configs(arguments)
     try:
-        return NLTCLI(
+        return kind(
             RenderingModule,
             LightTransportDataModule,
             subclass_mode_model=True,
             seed_everything_default=0,
             # The samplers are ours: Lightning's would repeat samples at evaluation.
-            trainer_defaults=trainer_defaults(),
+            trainer_defaults=trainer_defaults(callbacks),
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"exit_on_error": False},
             args=arguments,
+            run=run,
         )
     except ArgumentError as error:
-        raise UserError(_with_place(str(error), given, arguments[0])) from None
+        raise UserError(_with_place(str(error), given, arguments[0] if run else "fit")) from None
     except UserError as error:  # one from a loader process comes with that process's traceback
         raise type(error)(str(error).rpartition("UserError: ")[2].strip()) from None
 
 
-def _check_configs(arguments: list[str]) -> dict[str, str]:
+def _sources(arguments: list[str]) -> dict[str, str]:
     """What settings come from: --config files, once they can be read, and other arguments, with their text.
 
     Raises:
@@ -161,6 +187,7 @@ def _check_configs(arguments: list[str]) -> dict[str, str]:
 def _one_line(message: str) -> str:
     """jsonargparse's or Lightning's message, without the alternatives that were not meant."""
     message = " ".join(message.split())
+    message = re.sub(r"Group '([\w.]+)' does not accept option '(\w+)'", r"Option '\1.\2' is not accepted", message)
     return re.sub(r"Does not validate .*? Errors: - (.*?) - Expected a <class 'NoneType'>.*", r"\1", message)
 
 
@@ -177,14 +204,20 @@ def _with_place(message: str, given: dict[str, str], command: str) -> str:
 PRECISIONS = ("32-true", "bf16-mixed")  # of the trainings, as the device has it
 
 
-def trainer_defaults() -> dict[str, Any]:
+def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:
     """What the trainer does unless a config says otherwise."""
     return {
         "precision": PRECISIONS[Policy.for_device(default_device()).bfloat16],
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
         "default_root_dir": "runs",
-        "callbacks": [LearningRateMonitor(logging_interval="epoch"), Checkpoints(), ImageGrid(), Predictions()],
+        "callbacks": [
+            LearningRateMonitor(logging_interval="epoch"),
+            Checkpoints(),
+            ImageGrid(),
+            Predictions(),
+            *callbacks,
+        ],
     }
 
 

@@ -24,14 +24,17 @@ from torch.utils.data import default_collate
 from nlt import paths, training
 from nlt.baselines.cnn import CNN
 from nlt.cli import main
+from nlt.data import engines
 from nlt.data.dataset import LightTransportDataset
+from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import clock, compare, comparison
+from nlt.evaluation import clock, compare, comparison, progress
 from nlt.evaluation.dashboard import write_logs
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.gallery import Shown, worst_pixels
 from nlt.evaluation.report import draw
 from nlt.evaluation.results import load, write_images, write_rows
+from nlt.evaluation.trainings import Training, train
 from nlt.models.module import RenderingModule
 from nlt.paths import CONFIGS, PROJECT
 
@@ -44,7 +47,12 @@ UNTRAINED = ("path_tracing_1", "path_tracing_4", "path_tracing_16", "oidn_1", "o
 STEPS = 6  # 4 to an epoch
 # Methods that nothing in the package knows of.
 EXTRA = """
+import os
+import signal
+from pathlib import Path
+
 from nlt.baselines.cnn import CNN
+from nlt.models.nlt import NeuralLightTransport
 
 class Diverges(CNN):
     def features(self, batch, transported=None):
@@ -54,13 +62,26 @@ class Fails(CNN):
     def training_step(self, batch, batch_idx):
         raise RuntimeError("out of\\nluck")
 
+class Killed(CNN):
+    def training_step(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+class KilledOnce(NeuralLightTransport):
+    # In the second epoch, while a checkpoint is being written.
+    def training_step(self, batch, batch_idx):
+        if self.global_step == 5 and not Path("killed").exists():
+            (kept,) = Path(self.trainer.log_dir).glob("checkpoints/*.ckpt")
+            assert "step=4" in kept.name
+            truncated = kept.with_name("epoch=7-step=99.ckpt")
+            truncated.write_bytes(kept.read_bytes()[:-1000])
+            os.utime(truncated, (2**31, 2**31))
+            Path("killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().training_step(batch, batch_idx)
+
 class Extra(CNN):
     stages = ("photons", "gbuffer")
 """
-
-
-class Killed(BaseException):
-    """No error of the training's own: it is not tried again."""
 
 
 class World(SimpleNamespace):
@@ -80,6 +101,9 @@ class World(SimpleNamespace):
         """The newest directory of a method's training."""
         found = self.folder.glob(f"runs/*/{method}-" + "[0-9a-f]" * 8)
         return max(found, key=lambda path: path.stat().st_mtime)
+
+    def took(self, method):
+        return json.loads((self.run(method) / "done.json").read_text())
 
     def checkpoint(self, method):
         (path,) = self.run(method).glob("checkpoints/*.ckpt")
@@ -106,6 +130,7 @@ def world(tiny, tmp_path_factory, one_thread):
         patch.chdir(folder)
         patch.syspath_prepend(folder)
         patch.setattr(paths, "CONFIGS", folder / "configs")
+        patch.setattr(engines, "cores", lambda: 1)  # and so many threads in a training's process
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
         patch.setattr(clock.Clock, "_frame", spy)
@@ -121,11 +146,26 @@ def world(tiny, tmp_path_factory, one_thread):
 
 @pytest.fixture
 def trainings(monkeypatch):
-    """The trainings that are begun, as their arguments."""
+    """The trainings that are begun."""
     begun = []
-    original = training.run_lightning
-    monkeypatch.setattr(training, "run_lightning", lambda arguments: (begun.append(arguments), original(arguments))[1])
+    original = engines.Local.run
+    monkeypatch.setattr(engines.Local, "run", lambda self, *jobs: (begun.extend(jobs[1]), original(self, *jobs))[1])
     return begun
+
+
+@pytest.fixture
+def more_methods(world):
+    """Adds methods of EXTRA, in lower case, for a test."""
+    added = []
+
+    def add(*names):
+        for name in names:
+            content = {"model": {"class_path": f"extra_method.{name}"}}
+            added.append(write(world.folder / f"configs/model/{name.lower()}.yaml", content))
+
+    yield add
+    for path in added:
+        path.unlink()
 
 
 def methods():
@@ -254,7 +294,7 @@ def test_a_second_device_adds_its_times(world, trainings, monkeypatch):
     shutil.copytree(world.folder / "out", world.folder / "devices", ignore=shutil.ignore_patterns("*.png", "*.svg"))
     here, defaults = compare.surroundings, training.trainer_defaults()
     (other,) = {*training.PRECISIONS} - {defaults["precision"]}
-    monkeypatch.setattr(training, "trainer_defaults", lambda: defaults | {"precision": other})
+    monkeypatch.setattr("nlt.evaluation.trainings.trainer_defaults", lambda: defaults | {"precision": other})
     monkeypatch.setattr(compare, "surroundings", lambda device: here(device) | {"device": "GPU, made up"})
     second = world.compare("--methods", "cnn", "path_tracing_1", out="devices")
     assert trainings == []
@@ -275,7 +315,7 @@ def test_one_methods_config_retrains_this_method(world, trainings):
     file.write_text(before + "  init_args:\n    learning_rate: 0.01\n")
     try:
         rows = world.compare("--methods", "cnn", "feature_projection")
-        assert len(trainings) == 1 and f"--config={file}" in trainings[0]
+        assert len(trainings) == 1 and str(file) in trainings[0].files
         assert rows["feature_projection"]["mse"] != world.rows["feature_projection"]["mse"]
         assert rows["cnn"]["mse"] == world.rows["cnn"]["mse"]
     finally:
@@ -284,68 +324,139 @@ def test_one_methods_config_retrains_this_method(world, trainings):
     assert len(trainings) == 1 and rows["feature_projection"]["mse"] == world.rows["feature_projection"]["mse"]
 
 
-def test_a_killed_training_goes_on(world, trainings, monkeypatch):
-    """Killed in the second epoch, while a checkpoint was being written: what comes out is as if nothing had been."""
-    whole = torch.load(world.checkpoint("nlt"), weights_only=True)
-    run = world.run("nlt")
-    shutil.rmtree(run)
-    step = RenderingModule.training_step
+def test_a_killed_training_goes_on(world, more_methods):
+    """In the same comparison, from its last whole checkpoint: what comes out is as if nothing had been."""
+    more_methods("KilledOnce")
+    row = world.compare("--methods", "killedonce")["killedonce"]
+    assert (world.folder / "killed").exists() and world.took("killedonce")["resumed"]
+    assert row["status"] == "ok" and row["mse"] == world.rows["nlt"]["mse"]
+    assert same_weights(world.run("killedonce"), world.run("nlt"))
 
-    def killed(self, batch, batch_idx):
-        if self.global_step == STEPS - 1:
-            raise Killed
-        return step(self, batch, batch_idx)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(RenderingModule, "training_step", killed)
-        with pytest.raises(Killed):
-            world.compare("--methods", "nlt")
-    assert not (run / "done.json").exists()
-    kept = world.checkpoint("nlt")
-    assert torch.load(kept, weights_only=True)["global_step"] == 4
-    truncated = run / "checkpoints/epoch=7-step=99.ckpt"
-    truncated.write_bytes(kept.read_bytes()[:-1000])
-    os.utime(truncated, (2**31, 2**31))
-
-    row = world.compare("--methods", "nlt")["nlt"]
-    assert f"--ckpt_path={kept}" in trainings[-1] or f"--ckpt_path={kept.relative_to(world.folder)}" in trainings[-1]
-    assert row["mse"] == world.rows["nlt"]["mse"]
-    resumed = torch.load(training.newest_checkpoint(run), weights_only=True)
-    assert all(torch.equal(resumed["state_dict"][name], value) for name, value in whole["state_dict"].items())
+def same_weights(run, other):
+    weights = [torch.load(training.newest_checkpoint(path), weights_only=True)["state_dict"] for path in (run, other)]
+    return all(torch.equal(weights[0].pop(name), value) for name, value in weights[1].items()) and not weights[0]
 
 
 def test_a_lost_mark_costs_no_step(world, trainings):
     """Killed between the last checkpoint and done.json: the training is found finished."""
     (world.run("cnn") / "done.json").unlink()
     row = world.compare("--methods", "cnn")["cnn"]
-    assert len(trainings) == 1 and any(argument.startswith("--ckpt_path=") for argument in trainings[0])
+    assert len(trainings) == 1 and world.took("cnn")["resumed"]
     assert row["mse"] == world.rows["cnn"]["mse"]
 
 
 # ---- rows that fail, seeds, sizes -----------------------------------------------------------------------
 
 
-def test_rows_that_diverge_or_fail_are_shown(world, trainings):
-    """The others go on; what diverged is not trained again, what died is, twice."""
-    for name in ("Diverges", "Fails"):
-        write(world.folder / f"configs/model/{name.lower()}.yaml", {"model": {"class_path": f"extra_method.{name}"}})
+def test_rows_that_diverge_or_fail_are_shown(world, trainings, more_methods, capfd):
+    """The others go on; what diverged is not trained again, what died is, once, and when the command is given again."""
+    more_methods("Diverges", "Fails", "Killed")
+    methods = ("cnn", "diverges", "fails", "killed")
+    rows = world.compare("--workers=2", "--methods", *methods, out="bad")
+    assert [rows[name]["status"] for name in methods] == ["ok", "1 of 1 diverged", "1 of 1 failed", "1 of 1 failed"]
+    messages = {name: row["message"] for name, row in world.runs("bad").items()}
+    assert "train/loss is nan at step 0" in messages["diverges"]
+    assert messages["fails"] == "RuntimeError: out of luck" and messages["killed"] == "exit code -9"
+    assert (world.run("fails") / "log.txt").read_text().count("Traceback") == 2
+    printed = capfd.readouterr().out
+    assert "killed, seed 3    failed    exit code -9" in printed and "trainings: 1 diverged, 2 failed" in printed
+    assert rows["fails"]["mse"] == rows["diverges"]["mse"] == "" and float(rows["cnn"]["mse"]) > 0
+    table = (world.folder / "bad/table.md").read_text()
+    assert "| diverges [1 of 1 diverged] | – |" in table
+    assert [job.method for job in trainings] == ["diverges", "fails", "killed"]
+    world.compare("--methods", "diverges", out="bad")
+    assert len(trainings) == 3
+
+
+@pytest.mark.parametrize("section", ["model", "trainer", "data"])
+def test_a_mistake_in_the_last_config(world, trainings, capfd, section):
+    """Is found before the first training."""
+    content = merge({"model": {"class_path": "extra_method.Extra"}}, {section: {"init_args": {"no_such": 1}}})
+    file = write(world.folder / "configs/model/wrong.yaml", content)
     try:
-        rows = world.compare("--methods", "cnn", "diverges", "fails", out="bad")
-        assert [rows[name]["status"] for name in ("cnn", "diverges", "fails")] == [
-            "ok", "1 of 1 diverged", "1 of 1 failed",
-        ]  # fmt: skip
-        runs = world.runs("bad")
-        assert "train/loss is nan at step 0" in runs["diverges"]["message"]
-        assert runs["fails"]["message"] == "RuntimeError: out of luck"
-        assert rows["fails"]["mse"] == rows["diverges"]["mse"] == "" and float(rows["cnn"]["mse"]) > 0
-        table = (world.folder / "bad/table.md").read_text()
-        assert "| diverges [1 of 1 diverged] | – |" in table
-        assert len(trainings) == 3
-        world.compare("--methods", "diverges", out="bad")
-        assert len(trainings) == 3
+        arguments = ["compare", "--config", str(world.config), "--seeds=9", "--methods", "cnn", "wrong"]
+        assert main(arguments) == 2
     finally:
-        for name in ("diverges", "fails"):
-            (world.folder / f"configs/model/{name}.yaml").unlink()
+        file.unlink()
+    error = capfd.readouterr().err
+    assert error.startswith("nlt: error: ") and error.count("\n") == 1
+    assert str(file) in error and ("no_such" if section == "model" else "init_args") in error
+    assert trainings == []
+
+
+@pytest.fixture
+def one_core():
+    """For processes elsewhere, too: with other numbers of threads, sums are rounded otherwise."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    yield
+    os.sched_setaffinity(0, cores)
+
+
+def test_on_a_dask_cluster(world, tmp_path, one_core):
+    """In a process of a worker elsewhere: the same bytes as here."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        assert trained_elsewhere(world, tmp_path, cluster.scheduler_address)
+
+
+def test_on_slurm(world, tmp_path, monkeypatch, one_core):
+    """By submitit's own stand-in for it."""
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.setattr("submitit.Job._results_timeout_s", 0)  # for file systems that are late
+    assert trained_elsewhere(world, tmp_path, "slurm-local")
+
+
+def trained_elsewhere(world, folder, scheduler):
+    found = comparison.Comparison.load(str(world.config), None, None, ["cnn"])
+    job = Training.of(found, "cnn", 3, folder)
+    assert train([job], scheduler, 1, {}) == {}
+    return job.took["threads"] == 1 and same_weights(job.run, world.run("cnn"))
+
+
+def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
+    """What is new, a line each; a row's end, and in between all that are in training when it is time again."""
+    monkeypatch.setattr(progress, "_READ", 0)
+    names = {tmp_path / name: f"{name}, seed 0" for name in ("cnn", "nlt")}
+    write_bytes(tmp_path / "nlt" / progress.PROGRESS, b"of an earlier comparison")
+    table = progress.ProgressTable(names)
+
+    def shown(died=(), **training):
+        for name, content in training.items():
+            write_bytes(
+                tmp_path / name / (progress.DONE if "done" in content else progress.PROGRESS),
+                json.dumps(content).encode(),
+            )
+        table.show(dict(died))
+        return capsys.readouterr().out
+
+    assert shown().splitlines()[:2] == ["  cnn, seed 0  waiting", "  nlt, seed 0  waiting"]
+    step = {"state": "training", "steps": 100, "loss": 0.25, "eta_s": 75}
+    out = shown(cnn={**step, "step": 25}, nlt={**step, "step": 50})
+    assert "  cnn, seed 0  training  step     25 of 100     loss 0.25      ETA 01:15" in out and "2 training\n" in out
+    assert shown(cnn={**step, "step": 30}) == ""
+    monkeypatch.setattr(progress, "_PRINT", 0)
+    assert "step     75 of 100" in shown(cnn={**step, "step": 75})
+    # Half of the way that is to go was made here: as long again.
+    assert re.search(r"^(\S+) trainings: 2 training, ETA \1$", shown(cnn={**step, "step": 100}), re.MULTILINE)
+    assert "  cnn, seed 0  done" in shown(cnn={"done": True})
+    assert "  nlt, seed 0  failed    exit code -9" in shown({tmp_path / "nlt": "exit code -9"})
+
+
+@pytest.mark.parametrize(
+    ("scale", "data", "name"),
+    [
+        (None, None, "table2"),
+        ("small", "real/living_room_moving_lights", "table2"),
+        ("demo", None, "table2-demo"),
+        ("demo", "real/static_egg", "table2-demo-real-static_egg"),
+        ("there/large.yaml", None, "table2-large"),
+    ],
+)
+def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
+    assert comparison.Comparison.load("table2", scale, data, None).name == name
 
 
 def test_seeds(world, trainings):

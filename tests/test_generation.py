@@ -138,6 +138,33 @@ def test_worker_killed_twice(tmp_path, monkeypatch):
         generate(spec_of(), tmp_path, workers=1)
 
 
+@pytest.mark.parametrize("preload", [(), ("json",)])
+def test_nothing_outlives_a_killed_command(preload, tmp_path):
+    """Its processes end, forked ones too."""
+    (tmp_path / "beating.py").write_text(
+        "import time\nfrom pathlib import Path\n"
+        "def beat(job, threads, tick):\n"
+        "    while True:\n"
+        "        Path(job).write_text(str(time.time()))\n"
+        "        tick(1)\n"
+        "        time.sleep(0.02)\n"
+    )
+    run = f"list(Local(1, {preload}).run(beating.beat, ['beat'], {{}}))"
+    code = f"from nlt.data.engines import Local; import beating; {run}"
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    command = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    beat = tmp_path / "beat"
+    while not (beat.exists() and beat.read_text()):
+        assert command.poll() is None
+        time.sleep(0.05)
+    command.kill()
+    seen = []
+    while len(seen) < 2 or seen[-1] != seen[-2]:
+        assert len(seen) < 20
+        seen.append(beat.read_text())
+        time.sleep(1)
+
+
 # ---- nothing is compiled twice --------------------------------------------------------------------------
 
 

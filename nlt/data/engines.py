@@ -9,8 +9,11 @@ import importlib
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
+import sys
 import time
 from collections.abc import Callable, Generator, Mapping
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,11 +29,7 @@ _SLURM_WORKERS = 64
 
 
 class Died(Exception):
-    """A process ended before its work was done; `job` says which."""
-
-    def __init__(self, reason: str, job: Any = None) -> None:
-        super().__init__(reason)
-        self.job = job
+    """A process ended before its work was done."""
 
 
 class Engine(Protocol):
@@ -38,26 +37,31 @@ class Engine(Protocol):
 
     workers: int
 
-    def run(self, work: Work, jobs: list[Any]) -> Ticks:
-        """Run all jobs.
+    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
+        """Run all jobs. One that dies is run once more; if it dies again, `died` says of what, and the others go on.
 
         Raises:
             UserError: `work` raised it.
-            Died: a job's process died, more often than the engine tries; the other jobs have been run.
         """
         ...
 
 
-def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str]) -> Engine:
-    """The engine that `--scheduler` names: local, slurm, slurm-local, or a Dask scheduler's address."""
+def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], preload: tuple[str, ...] = ()) -> Engine:
+    """The engine that `--scheduler` names: local, slurm, slurm-local, or a Dask scheduler's address.
+
+    Args:
+        workers: jobs side by side (default: a core each; on Dask, as it has threads; in a Slurm array, 64).
+        slurm: options of a Slurm job.
+        preload: modules that take long to import and start no threads (so not Mitsuba): imported once on a machine.
+    """
     if slurm and scheduler != "slurm":
         raise UserError("--slurm: options for --scheduler slurm alone")
     if scheduler == "local":
-        return Local(workers or cores())
+        return Local(workers or cores(), preload)
     if scheduler in ("slurm", "slurm-local"):
         return Slurm(scheduler, workers or _SLURM_WORKERS, slurm)
     if "://" in scheduler:
-        return Dask(scheduler, workers)
+        return Dask(scheduler, workers, preload)
     raise UserError(f"--scheduler: must be local, slurm or an address such as tcp://host:8786, is {scheduler!r}")
 
 
@@ -69,40 +73,43 @@ def cores() -> int:
 class Local:
     """Processes of this machine."""
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, preload: tuple[str, ...] = ()) -> None:
+        self.workers, self._preload = workers, preload
 
-    def run(self, work: Work, jobs: list[Any]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
         waiting, threads = list(jobs), max(1, cores() // self.workers)
         running: dict[Process, Any] = {}
-        counters: list[Any] = []
-        died = None
+        counters: dict[Any, Any] = {}
+        tried = set()
         try:
             while waiting or running:
                 while waiting and len(running) < self.workers:
                     job = waiting.pop(0)
-                    counters.append(_counter())
-                    running[Process(_work, work, job, threads, counters[-1], os.getpid())] = job
+                    counters[job] = _counter()
+                    content = pickle.dumps((work, job))
+                    running[Process(_work, content, threads, counters[job], preload=self._preload)] = job
                 multiprocessing.connection.wait([process.sentinel for process in running], timeout=0.5)
-                yield sum(counter.value for counter in counters)
+                yield sum(counter.value for counter in counters.values())
                 for process in [process for process in running if not process.is_alive()]:
                     job = running.pop(process)
                     try:
                         process.result()
                     except Died as error:
-                        died = Died(str(error), job)
+                        if job in tried:
+                            died[job] = str(error)
+                        else:
+                            tried.add(job)
+                            waiting.append(job)
         finally:
             for process in running:
                 process.kill()
-        if died:
-            raise died
 
 
 class Dask:
     """A Dask cluster. A job whose worker is lost goes to another one, as often as the scheduler allows."""
 
-    def __init__(self, address: str, workers: int | None) -> None:
-        self._address = address
+    def __init__(self, address: str, workers: int | None, preload: tuple[str, ...] = ()) -> None:
+        self._address, self._preload = address, preload
         with self._connect() as client:
             self.workers = workers or max(1, sum(client.nthreads().values()))
 
@@ -113,11 +120,11 @@ class Dask:
         except (OSError, ValueError) as error:
             raise UserError(f"--scheduler: {self._address}: no Dask scheduler answers ({error})") from None
 
-    def run(self, work: Work, jobs: list[Any]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
         with self._connect() as client:
-            # `retries` if the job's process dies; if the worker does, Dask's own setting `allowed-failures` counts.
-            futures = client.map(_on_dask, [work] * len(jobs), jobs, pure=False, retries=2)
-            yield from _wait(dict(zip(futures, jobs, strict=True)))
+            # Pickled, so that Dask's workers need not import what the work does.
+            submit = lambda job: client.submit(_on_dask, pickle.dumps((work, job)), self._preload, pure=False)
+            yield from _wait({submit(job): job for job in jobs}, submit, died)
 
 
 class Slurm:
@@ -139,17 +146,20 @@ class Slurm:
         except (AssertionError, NameError) as error:
             raise UserError(f"--slurm: {str(error).splitlines()[0]}") from None
 
-    def run(self, work: Work, jobs: list[Any]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
+        futures = dict(zip(self._submit(work, jobs), jobs, strict=True))
         try:
-            tasks = self._executor.map_array(_on_slurm, [work] * len(jobs), jobs)
-        except Exception as error:  # submitit has no class of its own for what sbatch refuses
-            raise UserError(f"--scheduler slurm: {' '.join(str(error).split())}") from None
-        try:
-            yield from _wait(dict(zip(tasks, jobs, strict=True)))
+            yield from _wait(futures, lambda job: self._submit(work, [job])[0], died)
         finally:
-            for task in tasks:
+            for task in futures:
                 if not task.done():
                     task.cancel(check=False)
+
+    def _submit(self, work: Work, jobs: list[Any]) -> list[Any]:
+        try:
+            return list(self._executor.map_array(_on_slurm, [work] * len(jobs), jobs))
+        except Exception as error:  # submitit has no class of its own for what sbatch refuses
+            raise UserError(f"--scheduler slurm: {' '.join(str(error).split())}") from None
 
 
 def _extra(name: str) -> Any:
@@ -159,9 +169,9 @@ def _extra(name: str) -> Any:
         raise UserError(f"--scheduler: {name} is not installed; run pip install 'nlt[cluster]'") from None
 
 
-def _wait(futures: dict[Any, Any]) -> Ticks:
+def _wait(futures: dict[Any, Any], submit: Callable[[Any], Any], died: dict[Any, str]) -> Ticks:
     """Until all are done: each returns what the user is to be told, or raises because it died."""
-    died = None
+    tried = set()
     while futures:
         time.sleep(_POLL)
         yield None
@@ -170,25 +180,31 @@ def _wait(futures: dict[Any, Any]) -> Ticks:
             try:
                 mistake = future.result()
             except Exception as error:  # Dask and submitit each have their own for a lost worker
-                died = Died(" ".join(str(error).split()), job)
+                if job in tried:
+                    died[job] = " ".join(str(error).split())
+                else:
+                    tried.add(job)
+                    futures[submit(job)] = job
                 continue
             if mistake:
                 raise UserError(mistake)
-    if died:
-        raise died
 
 
-def _on_dask(work: Work, job: Any) -> str | None:
+def _on_dask(content: bytes, preload: tuple[str, ...]) -> str | None:
     from distributed import get_worker
 
-    # Dask's workers are daemons, to which multiprocessing allows no children. Ours watch whether we live.
-    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+    _allow_children()
     threads = max(1, cores() // get_worker().state.nthreads)
     try:
-        Process(_work, work, job, threads, _counter(), os.getpid()).result()
+        Process(_work, content, threads, _counter(), preload=preload).result()
     except UserError as error:
         return str(error)
     return None
+
+
+def _allow_children() -> None:
+    # Multiprocessing denies them to daemons, as Dask's workers and our processes are. Ours watch whether we live.
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
 
 
 def _on_slurm(work: Work, job: Any) -> str | None:
@@ -204,21 +220,43 @@ def _counter() -> Any:
     return _CONTEXT.RawValue("q", 0)
 
 
-def _work(work: Work, job: Any, threads: int, counter: Any, parent: int) -> None:
+def _work(content: bytes, threads: int, counter: Any) -> None:
+    work, job = pickle.loads(content)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    _allow_children()
+
     def tick(samples: int) -> None:
-        if os.getppid() != parent:
+        if not parent.is_alive():
             os._exit(1)  # the run was killed: nobody waits for this
         counter.value += samples
 
     work(job, threads, tick)
 
 
-class Process:
-    """Calls a function in a process that ends afterwards."""
+def _forking(preload: tuple[str, ...]) -> Any:
+    """A context whose processes are forked from one that has imported these modules and nothing else."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # else it imports from elsewhere than we, before Python 3.13
+    try:
+        forkserver.ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+    return context
 
-    def __init__(self, function: Callable, *arguments: Any) -> None:
-        self._receive, send = _CONTEXT.Pipe(duplex=False)
-        self._process = _CONTEXT.Process(target=_send_result, args=(send, function, arguments), daemon=True)
+
+class Process:
+    """Calls a function in a process that ends afterwards, into which `preload` was imported once for all processes."""
+
+    def __init__(self, function: Callable, *arguments: Any, preload: tuple[str, ...] = ()) -> None:
+        context: Any = _forking(preload) if preload else _CONTEXT
+        self._receive, send = context.Pipe(duplex=False)
+        self._process = context.Process(target=_send_result, args=(send, function, arguments), daemon=True)
         self._process.start()
         send.close()
         self.sentinel, self.is_alive, self.kill = self._process.sentinel, self._process.is_alive, self._process.kill

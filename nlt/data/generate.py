@@ -50,9 +50,7 @@ def generate(
 
     Args:
         root: of datasets: a directory or an fsspec URL, for several machines one that all of them see.
-        workers: jobs side by side (default: a core each; on a cluster, as it has threads; in a Slurm array, 64).
-        scheduler: as `nlt.data.engines.find_engine`.
-        slurm: options of a Slurm job.
+        workers, scheduler, slurm: as `nlt.data.engines.find_engine`.
 
     Raises:
         UserError: a scene is wrong, a worker failed twice, or the disk has no room.
@@ -114,24 +112,19 @@ def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
 
 
 def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) -> None:
-    """Run what is missing; once more what a job that died has left undone."""
+    """Run what is missing."""
     left = lambda: sum(shard.stop - shard.start for shard in _shards(spec, missing_files(directory, spec)))
-    total = left()
-    with tqdm(total=total, unit="sample", desc="rendering", file=sys.stderr, mininterval=1.0) as bar:
-        died = None
-        for _ in range(2):
-            before = left()
-            try:
-                with closing(engine.run(work, plan(spec, missing_files(directory, spec), engine.workers))) as ticks:
-                    for ticked in ticks:
-                        bar.update(total - (left() if ticked is None else before - ticked) - bar.n)
-                died = None
-                break
-            except Died as error:
-                died = error
+    total, died = left(), dict[Job, str]()
+    jobs = plan(spec, missing_files(directory, spec), engine.workers)
+    with (
+        tqdm(total=total, unit="sample", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
+        closing(engine.run(work, jobs, died)) as ticks,
+    ):
+        for ticked in ticks:
+            bar.update((total - left() if ticked is None else ticked) - bar.n)
         bar.update(total - left() - bar.n)
-    if died:
-        raise UserError(f"rendering {spec.scenes[died.job.scene]}: a worker died twice ({died})")
+    for job, reason in died.items():
+        raise UserError(f"rendering {spec.scenes[job.scene]}: a worker died twice ({reason})")
     if missing := missing_files(directory, spec):
         raise UserError(f"{directory}: still without {missing[0]}: do all machines see this directory?")
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from nlt.data.dataset import LightTransportDataset
+from nlt.data.engines import Died
 from nlt.data.generate import generate
 from nlt.data.spec import load_spec, read_configs
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.clock import Clock
-from nlt.evaluation.comparison import Comparison
+from nlt.evaluation.comparison import Comparison, untrained
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin, surroundings
@@ -29,26 +31,35 @@ from nlt.evaluation.results import (
     write_timings,
 )
 from nlt.evaluation.tables import live_header, live_row, write_tables
-from nlt.evaluation.trainings import obtain
+from nlt.evaluation.trainings import Training, check, train
 from nlt.models.policy import default_device
 
 
 def compare(
-    config: str,
+    comparison: Comparison,
     out: str | None = None,
-    scale: str | None = None,
-    data: str | None = None,
-    methods: list[str] | None = None,
-    seeds: int = 1,
+    workers: int | None = None,
+    scheduler: str = "local",
+    slurm: Mapping[str, str] | None = None,
 ) -> Path:
-    """Everything that a table needs, of which what is there already is kept. Returns its directory."""
+    """Everything that a table needs, of which what is there already is kept. Returns its directory.
+
+    Args:
+        workers: trainings side by side (default: on this machine in turn).
+        scheduler, slurm: as `nlt.data.engines.find_engine`, for generation and trainings; the rest is done here.
+    """
     start, begun = time.time(), origin()
-    comparison = Comparison.load(config, scale, data, methods, seeds)
     directory = Path(out or Path("results") / comparison.name)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
         raise UserError(f"{comparison.scale}: data.dataset.test: is 0; a comparison needs test samples")
-    dataset = generate(spec, root)
+    jobs = comparison.jobs()
+    check(comparison)
+    dataset = generate(spec, root, workers, scheduler, slurm)
+    trainings = {
+        job: Training.of(comparison, *job, Path("runs") / dataset.name) for job in jobs if not untrained(job[0])
+    }
+    died = train(list(trainings.values()), scheduler, workers, slurm or {})
     device = default_device()
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
     test, clock = Evaluation(frames, device), Clock(frames, device)
@@ -69,12 +80,16 @@ def compare(
     }
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
-    jobs = comparison.jobs()
     for number, (method, seed) in enumerate(jobs, 1):
         print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed, "status": OK, "message": ""}
         try:
-            module, took = obtain(comparison, method, seed, Path("runs") / dataset.name, device)
+            module, took = untrained(method), dict[str, Any]()
+            if module is None:
+                training = trainings[method, seed]
+                if training in died:
+                    raise Died(died[training])
+                module, took = training.load(device)
             metrics, each, radiance = test.evaluate(module)
             run |= clock.time(module) | metrics | clock.size(module) | took
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
@@ -84,6 +99,8 @@ def compare(
                 write_images(directory, method, radiance=radiance)
         except DivergedError as error:
             run |= {"status": DIVERGED, "message": str(error)}
+        except Died as error:
+            run |= {"status": FAILED, "message": str(error)}
         except (UserError, OSError):
             raise
         except Exception as error:  # whatever it is, the other rows go on

@@ -18,7 +18,10 @@ _KEYS = ("table", "data", "scale", "methods", "seed")
 
 @dataclass
 class Comparison:
-    """What a config of configs/compare asks for; METHOD@SIZE is a method in a size of configs/size."""
+    """What a config of configs/compare asks for; METHOD@SIZE is a method in a size of configs/size.
+
+    Its name says if it is at another scale or of other data.
+    """
 
     name: str
     data: Path
@@ -41,7 +44,10 @@ class Comparison:
         for key in content:
             if key not in _KEYS:
                 raise UserError(f"{file}: {key}: unknown key; known are {', '.join(_KEYS)}")
-        for key, value in (("data", data), ("scale", scale)):
+        names = [file.stem]
+        for key, value in (("scale", scale), ("data", data)):
+            if value and value != content.get(key):
+                names.append(find_config(key, value).stem if Path(value).suffix else value.replace("/", "-"))
             content[key] = value or content.get(key)
             if not isinstance(content[key], str):
                 raise UserError(f"{file}: {key}: missing; name a config of configs/{key}")
@@ -61,7 +67,7 @@ class Comparison:
             if "@" in method and size not in sizes:
                 raise UserError(f"{file}: methods: no size {size!r} in configs/size; known are {', '.join(sizes)}")
         return cls(
-            name=file.stem,
+            name="-".join(names),
             data=find_config("data", content["data"]),
             scale=find_config("scale", content["scale"]),
             table=table,

@@ -1,73 +1,140 @@
-"""The trainings behind a comparison: one per method and seed, each in a directory of its own, none made twice."""
+"""The trainings behind a comparison: independent jobs, each in a directory of its own, none made twice."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import os
 import time
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
 
-from nlt import training
+from nlt.data.engines import find_engine
 from nlt.data.files import write_bytes
 from nlt.data.spec import read_configs
-from nlt.errors import DivergedError, UserError
+from nlt.errors import DivergedError, UserError, as_mistake
 from nlt.evaluation.comparison import Comparison, untrained
+from nlt.evaluation.progress import DONE, Progress, ProgressTable
 from nlt.evaluation.provenance import origin
-from nlt.models.method import Method
 from nlt.models.module import RenderingModule
-from nlt.training import newest_checkpoint
+from nlt.training import PRECISIONS, check_configs, newest_checkpoint, run_lightning, trainer_defaults
 
 
-def obtain(
-    comparison: Comparison, method: str, seed: int, root: Path, device: torch.device
-) -> tuple[Method, dict[str, Any]]:
-    """The method, trained if it needs to be, and what that took.
+@dataclass(frozen=True)
+class Training:
+    """A job: a method's training with a seed.
+
+    Its directory `run` belongs to a hash of all that decides the outcome, so a method is trained anew only when that
+    changed. There lie its checkpoints, its log, how far it is, and, once it has come to an end, what it took.
+    """
+
+    method: str
+    seed: int
+    run: Path
+    files: tuple[str, ...]
+    precision: str
+
+    @classmethod
+    def of(cls, comparison: Comparison, method: str, seed: int, root: Path) -> Training:
+        """A comparison's training, in a directory below `root`."""
+        files = comparison.configs(method)
+        merged = read_configs(files)
+        # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
+        precisions = dict.fromkeys((trainer_defaults()["precision"], *PRECISIONS))
+        runs = {precision: root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions}
+        precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
+        # Absolute: processes elsewhere have other working directories.
+        paths = tuple(os.path.abspath(file) for file in files)
+        return cls(method, seed, runs[precision].absolute(), paths, precision)
+
+    @property
+    def took(self) -> dict[str, Any] | None:
+        """What it took, or how it diverged; None if it has not come to an end."""
+        done = self.run / DONE
+        took = json.loads(done.read_text()) if done.exists() else None
+        return took if took and ("diverged" in took or newest_checkpoint(self.run)) else None
+
+    def load(self, device: torch.device) -> tuple[RenderingModule, dict[str, Any]]:
+        """The trained method and what that took.
+
+        Raises:
+            DivergedError: it diverged, now or when it was tried before.
+        """
+        took, checkpoint = self.took or {}, newest_checkpoint(self.run)
+        if "diverged" in took:
+            raise DivergedError(took["diverged"])
+        assert checkpoint is not None
+        module = RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval()
+        return module, took | {"run": os.path.relpath(self.run)}
+
+
+def check(comparison: Comparison) -> None:
+    """Raises UserError if a config of any method would not do, before the first is trained."""
+    for method in comparison.methods:
+        if not untrained(method):
+            check_configs(comparison.configs(method))
+
+
+def train(
+    trainings: list[Training], scheduler: str, workers: int | None, slurm: Mapping[str, str]
+) -> dict[Training, str]:
+    """Train what has not come to an end yet; what died twice, and of what.
+
+    Each has a process of its own: it may be killed for its memory, and Lightning keeps state. Here these are forked
+    from one that has imported Lightning, which takes seconds.
 
     Raises:
-        DivergedError: its training diverged, now or when it was tried before.
+        UserError: a config or the dataset is wrong, or the disk is full.
     """
-    if module := untrained(method):
-        return module, {}
-    checkpoint, took = train(comparison, method, seed, root)
-    took["run"] = str(checkpoint.parents[1])
-    return RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval(), took
+    left = [training for training in trainings if not training.took]
+    died: dict[Training, str] = {}
+    if not left:
+        return died
+    engine = find_engine(scheduler, workers or (1 if scheduler == "local" else None), slurm, preload=(__name__,))
+    table = ProgressTable({t.run: f"{t.method}, seed {t.seed}" for t in left})
+    print(f"\n{len(left)} of {len(trainings)} trainings to do, {engine.workers} side by side", flush=True)
+    with closing(engine.run(_train, left, died)) as ticks:
+        for _ in ticks:
+            table.show({t.run: reason for t, reason in died.items()})
+    table.show({t.run: reason for t, reason in died.items()}, last=True)
+    for training in left:
+        if training not in died and not training.took:
+            raise UserError(f"{training.run}: still without {DONE}: do all machines see this directory?")
+    return {training: table.rows[training.run].message for training in died}
 
 
-def train(comparison: Comparison, method: str, seed: int, root: Path) -> tuple[Path, dict[str, Any]]:
-    """The checkpoint of a finished training and what it took; trains, or goes on training, if need be.
-
-    A run belongs to a hash of all that decides its outcome, so a method is trained anew only when that changed.
-    A training that dies is gone on with once; one that diverged is not tried again.
-    """
-    files = comparison.configs(method)
-    merged = read_configs(files)
-    # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
-    precisions = dict.fromkeys((training.trainer_defaults()["precision"], *training.PRECISIONS))
-    runs = [root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions]
-    run = next((run for run in runs if (run / "done.json").exists()), runs[0])
-    done = run / "done.json"
-    if not (done.exists() and ("diverged" in done.read_text() or newest_checkpoint(run))):
+def _train(training: Training, threads: int, tick: Callable[[int], None]) -> None:
+    """A job, in a process of its own; whatever it has to say goes to log.txt."""
+    run = training.run
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / "log.txt").open("ab") as log, (run / "lock").open("w") as lock:
+        for stream in (1, 2):
+            os.dup2(log.fileno(), stream)
+        with suppress(OSError):  # file systems without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until one is done that an earlier, killed comparison left in a queue
+        if training.took:
+            return
+        torch.set_num_threads(threads)
+        progress = Progress(run, tick)
         try:
-            try:
-                took = _fit(run, files, seed)
-            except (UserError, OSError):
-                raise
-            except Exception as error:
-                print(f"died of {type(error).__name__}: {error}; once more", flush=True)
-                took = _fit(run, files, seed)
+            took = _fit(training, progress) | {"threads": threads}
         except DivergedError as error:
             took = {"diverged": str(error)}
-        write_bytes(done, json.dumps(took).encode())
-    took = json.loads(done.read_text())
-    if "diverged" in took:
-        raise DivergedError(took["diverged"])
-    checkpoint = newest_checkpoint(run)
-    assert checkpoint is not None
-    return checkpoint, took
+        except UserError:
+            raise
+        except OSError as error:
+            raise as_mistake(error) from None
+        except Exception as error:
+            progress.died(error)
+            raise
+        write_bytes(run / DONE, json.dumps(took).encode())
 
 
 def _key(config: dict[str, Any], seed: int, precision: str) -> str:
@@ -76,18 +143,17 @@ def _key(config: dict[str, Any], seed: int, precision: str) -> str:
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
 
 
-def _fit(run: Path, files: list[str], seed: int) -> dict[str, Any]:
-    """Train in the directory `run`, from its newest checkpoint if it has one; what that took."""
-    run.mkdir(parents=True, exist_ok=True)
-    own = run / "run.yaml"
-    own.write_text(yaml.safe_dump(_run_config(run, seed)))
-    arguments = ["fit", *(f"--config={file}" for file in [*files, own])]
-    checkpoint = newest_checkpoint(run)
+def _fit(training: Training, progress: Progress) -> dict[str, Any]:
+    """Train, from the newest checkpoint if there is one; what that took."""
+    own = training.run / "run.yaml"
+    own.write_text(yaml.safe_dump(_run_config(training)))
+    arguments = ["fit", *(f"--config={file}" for file in (*training.files, own))]
+    checkpoint = newest_checkpoint(training.run)
     if checkpoint:
-        print(f"resuming from {checkpoint}")
+        print(f"resuming from {checkpoint}", flush=True)
         arguments.append(f"--ckpt_path={checkpoint}")
     begin = time.time()
-    cli = training.run_lightning(arguments)
+    cli = run_lightning(arguments, [progress])
     steps = cli.trainer.global_step
     return {
         "train_s": time.time() - begin,
@@ -98,15 +164,22 @@ def _fit(run: Path, files: list[str], seed: int) -> dict[str, Any]:
     }
 
 
-def _run_config(run: Path, seed: int) -> dict[str, Any]:
+def _run_config(training: Training) -> dict[str, Any]:
     # Hyperparameters are logged when the metrics are known: nlt/evaluation/dashboard.py.
-    logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
+    logger = {"save_dir": str(training.run), "name": "", "version": "", "default_hp_metric": False}
+    trainer = read_configs(list(training.files)).get("trainer") or {}
     return {
-        "seed_everything": seed,
-        "model": {"init_args": {"seed": seed}},
-        "data": {"seed": seed},
+        "seed_everything": training.seed,
+        "model": {"init_args": {"seed": training.seed}},
+        "data": {"seed": training.seed},
         "trainer": {
+            # Side by side are jobs; and Lightning's processes for more devices would run the whole command.
+            "precision": trainer.get(
+                "precision", training.precision
+            ),  # not what a machine elsewhere would choose: the directory is of this one
+            "devices": trainer.get("devices", 1),
             "enable_model_summary": False,
+            "enable_progress_bar": False,
             "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
         },
     }

@@ -1,0 +1,134 @@
+"""How far trainings are, wherever they run: each says so in its directory, and the comparison reads them all."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from tqdm import tqdm
+
+from nlt.data.files import write_bytes
+from nlt.evaluation.results import DIVERGED, FAILED
+
+# In a training's directory: how far it is, and, once it has come to an end, what it took or how it diverged.
+PROGRESS, DONE = "progress.json", "done.json"
+_WRITE, _READ, _PRINT = 2.0, 2.0, 60.0  # seconds between two of these
+_WAITING, _TRAINING, _DIED = "waiting", "training", "died"
+
+
+class Progress(L.Callback):
+    """Writes progress.json into the directory `run`, every few seconds at most, and calls `tick` at every step."""
+
+    def __init__(self, run: Path, tick: Callable[[int], None]) -> None:
+        self._file, self._tick = run / PROGRESS, tick
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._first, self._begun = trainer.global_step, time.monotonic()
+        self._write(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        self._tick(1)
+        if time.monotonic() - self._written > _WRITE:
+            self._write(trainer)
+
+    def on_validation_batch_end(self, *_: Any) -> None:
+        self._tick(0)
+
+    def _write(self, trainer: L.Trainer) -> None:
+        self._written = time.monotonic()
+        step, steps = trainer.global_step, trainer.estimated_stepping_batches
+        rate = (step - self._first) / (self._written - self._begun or math.inf)
+        state = {"state": _TRAINING, "step": step, "steps": steps, "eta_s": (steps - step) / rate if rate else math.nan}
+        loss = trainer.callback_metrics.get("train/loss", math.nan)
+        if trainer.is_global_zero:
+            write_bytes(self._file, json.dumps({**state, "loss": float(loss)}).encode())
+
+    def died(self, error: Exception) -> None:
+        """Say of what."""
+        message = " ".join(f"{type(error).__name__}: {error}".split())
+        write_bytes(self._file, json.dumps({"state": _DIED, "message": message}).encode())
+
+
+@dataclass
+class _Row:
+    """How far one is, as it was read last."""
+
+    state: str = _WAITING
+    step: int = 0
+    steps: float = math.nan
+    loss: float = math.nan
+    eta_s: float = math.nan
+    message: str = ""
+
+    @classmethod
+    def read(cls, run: Path) -> _Row:
+        try:
+            if (run / DONE).exists():
+                took = json.loads((run / DONE).read_text())
+                return cls(DIVERGED if DIVERGED in took else "done", message=took.get(DIVERGED, ""))
+            return cls(**json.loads((run / PROGRESS).read_text()))
+        except FileNotFoundError:
+            return cls()
+
+    @property
+    def fraction(self) -> float:
+        """Of its steps."""
+        if self.state in (_WAITING, _TRAINING, _DIED):
+            return self.step / self.steps if self.step else 0.0
+        return 1.0
+
+    def __str__(self) -> str:
+        if self.state != _TRAINING:
+            return f"{self.state:9} {self.message}".rstrip()
+        eta = "?" if math.isnan(self.eta_s) else tqdm.format_interval(self.eta_s)
+        return f"{self.state:9} step {self.step:6} of {self.steps:<7g} loss {self.loss:<9.4g} ETA {eta}"
+
+
+class ProgressTable:
+    """One table of all trainings, in lines that are never taken back, so that a log file shows them alike.
+
+    A row is printed when its state changes, those in training every minute; below them, all together.
+    """
+
+    def __init__(self, names: dict[Path, str]) -> None:
+        """Args: names: of the trainings, by their directories."""
+        self._names, self._width = names, max(map(len, names.values()))
+        self._begun, self._read, self._printed = time.monotonic(), -math.inf, -math.inf
+        self.rows = dict.fromkeys(names, _Row(""))
+        self._first: dict[Path, float] = {}  # how far a training was when it was begun here
+        for run in names:  # what an earlier comparison left that was killed, or lost its checkpoints
+            for name in (PROGRESS, DONE):
+                (run / name).unlink(missing_ok=True)
+
+    def show(self, died: Mapping[Path, str], last: bool = False) -> None:
+        """Print what is new, given those that died for good and of what."""
+        now = time.monotonic()
+        if now - self._read < _READ and not last:
+            return
+        self._read, before = now, self.rows
+        self.rows = {run: _Row.read(run) for run in self._names}
+        for run, reason in died.items():
+            self.rows[run] = _Row(FAILED, message=self.rows[run].message or reason)
+        due = now - self._printed > _PRINT
+        new = {run: r for run, r in self.rows.items() if r.state != before[run].state or (due and r.state == _TRAINING)}
+        for run, row in new.items():
+            if row.state == _TRAINING:
+                self._first.setdefault(run, row.fraction)
+            print(f"  {self._names[run]:{self._width}}  {row}")
+        if new:
+            self._printed = now
+            print(self._overall(now - self._begun), flush=True)
+
+    def _overall(self, seconds: float) -> str:
+        states = [row.state for row in self.rows.values()]
+        counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+        gained = sum(row.fraction - self._first.get(run, 0) for run, row in self.rows.items())
+        left = sum(1 - row.fraction for row in self.rows.values())
+        eta = f", ETA {tqdm.format_interval(seconds * left / gained)}" if gained > 0 and left else ""
+        return f"{tqdm.format_interval(seconds)} trainings: {counts}{eta}"
