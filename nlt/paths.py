@@ -12,6 +12,13 @@ def scenes_root() -> Path:
     return Path(os.environ.get("NLT_SCENES", PROJECT.parent / "shared" / "scenes"))
 
 
+def cache_root() -> Path:
+    """What may be deleted, for it can be had again: `NLT_CACHE`, else `$XDG_CACHE_HOME/nlt`, else `~/.cache/nlt`."""
+    return Path(
+        os.environ.get("NLT_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "nlt"
+    ).expanduser()
+
+
 def find_config(kind: str, name: str) -> Path:
     """A config by name (`configs/<kind>/<name>.yaml`, the name may hold folders) or by path."""
     return Path(name) if name.endswith((".yaml", ".yml")) else CONFIGS / kind / f"{name}.yaml"

