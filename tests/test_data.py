@@ -9,6 +9,7 @@ import pytest
 import torch
 from conftest import write_yaml
 from generated import SIZE, content, spec_of
+from safetensors.numpy import load_file
 
 from nlt.data import store
 from nlt.data.datamodule import LightTransportDataModule
@@ -17,6 +18,7 @@ from nlt.data.generate import generate
 from nlt.data.sample import BATCH_FIELDS, FIELDS, POINT_FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
+from nlt.scenes.camera import Camera
 
 
 @pytest.fixture
@@ -219,6 +221,44 @@ def test_reads_only_what_is_asked_for(dataset, monkeypatch):
         assert asked == [expected] and set(inputs) <= set(sample)
         if given:
             assert set(sample) == given | {"scene", "index", "exposure"}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_hold_what_is_stored(dataset, workers):
+    """Bit for bit, against the files read by safetensors and the formulas of a plain loop."""
+    spec = spec_of()
+    module = LightTransportDataModule(spec, str(dataset.parent), batch_size=5, workers=workers)
+    module.setup("fit")
+    points = load_file(dataset / store.points_name(0))
+    points = {name: stack[0] for name, stack in points.items() if not name.startswith(store.CRC)}
+    (first, *_) = module.train_dataloader()
+    assert sorted(first["index"].tolist()) != first["index"].tolist()
+    for row, index in enumerate(first["index"].tolist()):
+        shard = spec.shard("train", 0, index)
+        stacks = load_file(dataset / shard.name)
+        stored = {name: stacks[name][index - shard.start] for name in spec.fields("train")}
+        camera = Camera(stored["camera_matrix"], stored["world_to_view"], 16, 16)
+        moved = np.vstack([stored["translation"], np.zeros((1, 3), np.float32)])[points["object"]]
+        expected = {name: x.astype(np.float32) if x.dtype == np.float16 else x for name, x in stored.items()} | {
+            "view_direction": camera.directions(camera.centres()).T.reshape(3, 16, 16).astype(np.float32),
+            "point_position": points["position"] + moved,
+            "point_visible": np.append(stored["present"], True)[points["object"]],
+            "point_material": points["material"].astype(np.int64),
+            "point_albedo": points["albedo"],
+            "point_emission": points["emission"],
+            "scene": np.array(0),
+            "index": np.array(index),
+            "exposure": np.array(spec.descriptions[0].exposure, np.float32),
+        }
+        assert first.keys() == expected.keys()
+        for name, value in expected.items():
+            ours = first[name][row].numpy()
+            assert ours.dtype == value.dtype and ours.shape == value.shape, name
+            if value.dtype != np.float32:
+                assert np.array_equal(ours, value), name
+                continue
+            # View directions are computed in float64, in another order.
+            np.testing.assert_array_max_ulp(ours, value, maxulp=name == "view_direction")
 
 
 @pytest.mark.parametrize("inputs", [{"point_material"}, {"point_albedo"}, {"point_emission"}, {"point_visible"}])

@@ -8,7 +8,7 @@ import lightning as L
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler
+from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, collated
 from nlt.data.engines import cores
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
@@ -111,6 +111,7 @@ class LightTransportDataModule(L.LightningDataModule):
             batch_size=self.batch_size,
             sampler=sampler,
             drop_last=training,
+            collate_fn=collated,
             num_workers=self.workers,
             # Rendering starts threads, which a fork would lose. No leak: the memory of one scene's renderer stays.
             multiprocessing_context="spawn" if online else None,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import Dataset, Sampler, get_worker_info
 
 from nlt.data.files import AnyPath
 from nlt.data.sample import BATCH_FIELDS
@@ -33,6 +35,14 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         self.directory, self.spec, self.split = directory, spec, split
         self._reader = ShardReader()
         self._points = [read_points(directory / points_name(k)) for k in range(len(spec.scenes))]
+        self._static = [
+            {
+                "point_material": torch.from_numpy(points["material"].astype(np.int64)),
+                "point_albedo": torch.from_numpy(points["albedo"]),
+                "point_emission": torch.from_numpy(points["emission"]),
+            }
+            for points in self._points
+        ]
         stored = spec.fields(split)
         self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
         needed = set(stored) if self._wanted is None else self._wanted & set(stored)
@@ -50,13 +60,21 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """One sample; floats are float32."""
+        return {name: tensor[0] for name, tensor in self.__getitems__([index]).items()}
+
+    def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
+        """A batch, for `torch.utils.data.DataLoader` with `collated`: every value is copied once, to where it stays."""
+        samples = [self._tensors(*self._sample(index), index) for index in indices]
+        return {name: _stack([sample[name] for sample in samples]) for name in samples[0]}
+
+    def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
+        """The scene of a sample, and what is stored of it."""
         scene, row = divmod(index, self.spec.count(self.split))
         shard = self.spec.shard(self.split, scene, row)
-        stored = self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
-        return self._tensors(scene, index, stored)
+        return scene, self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
 
-    def _tensors(self, scene: int, index: int, stored: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        sample = {name: _tensor(array) for name, array in stored.items()}
+    def _tensors(self, scene: int, stored: dict[str, np.ndarray], index: int) -> dict[str, Tensor]:
+        sample = {name: torch.from_numpy(array) for name, array in stored.items()}
         if self._wants("view_direction"):
             size = self.spec.resolution
             camera = Camera(stored["camera_matrix"], stored["world_to_view"], size, size)
@@ -75,9 +93,7 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         return {
             "point_position": torch.from_numpy(position),
             "point_visible": torch.from_numpy(visible),
-            "point_material": torch.from_numpy(points["material"].astype(np.int64)),
-            "point_albedo": torch.from_numpy(points["albedo"]),
-            "point_emission": torch.from_numpy(points["emission"]),
+            **self._static[scene],
         }
 
 
@@ -90,8 +106,21 @@ def place_points(
     return points["position"] + translation[points["object"]], present[points["object"]]
 
 
-def _tensor(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float16 else np.array(array))
+def collated(batch: Any) -> Any:
+    """For `DataLoader(collate_fn=...)`: a batch of a `LightTransportDataset` is collated as it is read."""
+    return batch
+
+
+def _stack(tensors: list[Tensor]) -> Tensor:
+    """As torch.stack, halves as float32; in a loader's process right into memory that it shares, as torch's collate."""
+    shape, dtype = (len(tensors), *tensors[0].shape), tensors[0].dtype
+    out = torch.empty(0, dtype=torch.float32 if dtype == torch.float16 else dtype)
+    if get_worker_info():
+        out.set_(torch.UntypedStorage._new_shared(math.prod(shape) * out.itemsize))
+    out.resize_(shape)
+    for row, tensor in zip(out, tensors, strict=True):
+        row.copy_(tensor)
+    return out
 
 
 class EpochSampler(Sampler[int]):

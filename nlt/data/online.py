@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from torch import Tensor
+import numpy as np
 
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import AnyPath
@@ -37,12 +37,11 @@ class OnlineDataset(LightTransportDataset):
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """Render one sample; floats are float32."""
+    def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         count = len(self.spec.scenes)
         if not self._renderers:  # in the process that renders
             # Threads are set with the last one: with one thread, loading a scene waits for ever.
             threads = [*[None] * (count - 1), self._threads]
             self._renderers = [SampleRenderer(self.spec, k, threads[k]) for k in range(count)]
         number, scene = divmod(index, count)
-        return self._tensors(scene, index, self._renderers[scene].sample("train", number, only=self._stored))
+        return scene, self._renderers[scene].sample("train", number, only=self._stored)

@@ -36,17 +36,18 @@ def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
 
 
 class ShardReader:
-    """Random access to samples; keeps the files it has read open. Safe to use after a fork."""
+    """Random access to samples; keeps the files it has read mapped into memory. Safe to use after a fork."""
 
     def __init__(self) -> None:
-        self._files: OrderedDict[AnyPath, Any] = OrderedDict()
+        self._files: OrderedDict[AnyPath, dict[str, np.ndarray]] = OrderedDict()
         self._pid = os.getpid()
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_files": OrderedDict(), "_pid": -1}
 
     def read(self, path: AnyPath, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
-        """The fields of one sample of a shard. A damaged copy of a remote file is fetched once more.
+        """The fields of one sample of a shard: views of the file in memory. A damaged copy of a remote file is fetched
+        once more.
 
         Raises:
             UserError: the shard is missing, truncated, or fails its CRC.
@@ -65,24 +66,25 @@ class ShardReader:
     def _read(self, path: AnyPath, row: int, fields: list[str]) -> dict[str, np.ndarray]:
         advice = "delete the file and run `nlt generate` again"
         try:
-            file = self._open(path)
+            stacks = self._open(path)
             sample = {}
             for name in fields:
-                array = file.get_slice(name)[row : row + 1][0]
-                if zlib.crc32(array.tobytes()) != file.get_slice(CRC + name)[row : row + 1][0]:
+                array = stacks[name][row, ...]
+                if zlib.crc32(array.data) != stacks[CRC + name][row]:
                     raise UserError(f"{path}: damaged shard: sample {row}, field {name} fails its CRC; {advice}")
                 sample[name] = array
             return sample
         except FileNotFoundError:
             raise UserError(f"{path}: missing shard; run `nlt generate` again") from None
-        except SafetensorError as error:
+        except (SafetensorError, KeyError) as error:
             raise UserError(f"{path}: damaged shard ({error}); {advice}") from None
 
-    def _open(self, path: AnyPath) -> Any:
+    def _open(self, path: AnyPath) -> dict[str, np.ndarray]:
         if self._pid != os.getpid():
             self._files, self._pid = OrderedDict(), os.getpid()
         if path not in self._files:
-            self._files[path] = safe_open(local_copy(path), framework="numpy")
+            with safe_open(local_copy(path), framework="pt") as file:  # which, unlike "numpy", copies nothing
+                self._files[path] = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
             if len(self._files) > _OPEN_FILES:
                 self._files.popitem(last=False)
         self._files.move_to_end(path)
