@@ -1,0 +1,115 @@
+"""How long does the evaluation of a whole table take, stage by stage, with checkpoints at hand?
+
+    python benchmarks/evaluation.py                          # nine methods, 256 views at 64x64, all metrics
+    python benchmarks/evaluation.py --methods cnn nlt --views 64     # a part, and what the whole would take by it
+
+Writes results/benchmarks/evaluation.json. Random weights and samples of random bytes: neither changes what is
+computed. The reference features start from an empty cache; `references_cached_s` is the first method once more, with
+the cache on disk filled, as in a later run. A stage's seconds are those of its calls; what is in none is "rest".
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+from loading import build, synthetic
+
+from nlt.data.dataset import LightTransportDataset
+from nlt.data.spec import DatasetSpec
+from nlt.evaluation import judge
+from nlt.evaluation.frames import Frames
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.metrics import feature_cache, image_metrics
+from nlt.metrics.inception import Inception
+from nlt.models.module import RenderingModule
+from nlt.paths import config_names
+
+STAGES = {
+    "loading": (LightTransportDataset, "__getitems__"),
+    "network": (RenderingModule, "forward"),
+    "inception": (Inception, "forward"),
+    "flip": (image_metrics, "flip"),
+    "mssim": (image_metrics, "structural_similarity_index_measure"),
+    "feature_l1": (image_metrics, "feature_l1"),
+    "fid": (image_metrics.FID, "compute"),
+    "kid": (image_metrics.KID, "compute"),
+    "jackknife": (judge, "fid_and_kid_without"),
+    "cache_write": (feature_cache, "write_shard"),
+}
+
+
+def record(seconds: dict[str, float]) -> None:
+    """From now on, every stage adds the time of its calls."""
+    for stage, (owner, name) in STAGES.items():
+        function = getattr(owner, name)
+
+        def timed(*args: Any, function: Any = function, stage: str = stage, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                seconds[stage] += time.perf_counter() - start
+
+        setattr(owner, name, functools.wraps(function)(timed))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    nine = [name for name in config_names("model") if "/" not in name and not name.startswith(("path", "oidn"))]
+    parser.add_argument("--methods", nargs="+", default=nine, help="default: all trained ones")
+    parser.add_argument("--views", type=int, default=256)
+    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--width", type=int, default=16)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/evaluation.json"))
+    options = parser.parse_args()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    spec = DatasetSpec(["living_room"], resolution=options.resolution, train=0, val=0, test=options.views)
+    report: dict[str, Any] = {"options": {k: str(v) for k, v in vars(options).items()}, "methods": {}}
+    report["manifest"] = origin() | surroundings(device)
+    seconds: dict[str, float] = defaultdict(float)
+    record(seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["NLT_CACHE"] = str(Path(folder) / "cache")
+        directory = synthetic(spec, folder)
+        # Only methods that path trace ask more of it.
+        frames = cast(Frames, SimpleNamespace(dataset=LightTransportDataset(directory, spec, "test")))
+        evaluation = judge.Evaluation(frames, device)
+
+        def evaluate(method: str) -> dict[str, float]:
+            module = build(method, spec, options.width)
+            seconds.clear()
+            start = time.perf_counter()
+            evaluation.evaluate(module)
+            total = time.perf_counter() - start
+            return {**seconds, "rest": total - sum(seconds.values()), "total": total}
+
+        for method in options.methods:
+            report["methods"][method] = evaluate(method)
+            print(method, ", ".join(f"{k} {v:.2f}" for k, v in report["methods"][method].items()), flush=True)
+        evaluation = judge.Evaluation(frames, device)
+        report["references_cached_s"] = evaluate(options.methods[0])["total"]
+    rows = list(report["methods"].values())
+    report["total_s"] = sum(row["total"] for row in rows)
+    # By views and methods, and the first method, which computes the references, apart: an estimate.
+    others = rows[1:] or rows
+    mean = sum(row["total"] for row in others) / len(others)
+    report["nine_methods_256_views_s"] = (rows[0]["total"] + 8 * mean) * 256 / options.views
+    report["is_extrapolated"] = options.views != 256 or len(rows) != 9
+    print(f"total {report['total_s']:.1f} s; nine methods and 256 views: {report['nine_methods_256_views_s']:.0f} s"
+          + (" (extrapolated)" if report["is_extrapolated"] else ""))  # fmt: skip
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""How fast does training read? Against reading the same bytes with a CRC and nothing else, in one run on this machine.
+
+    python benchmarks/loading.py                     # writes results/benchmarks/loading.json
+
+A dataset of random bytes in the format of nlt/data/sample.py is written to a temporary folder and read from the page
+cache. The loader is the DataModule's own, with its shuffling, its processes and its CRCs, and its batches arrive in
+this process. The ceiling, in as many processes: `np.fromfile` of the bytes that the method reads of a sample, and
+their zlib.crc32. Both take turns, so that whatever else the machine does slows both; medians and best over turns.
+`cpu_ms` is the processor time of one sample without processes, which other work slows least.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pydoc
+import statistics
+import tempfile
+import time
+import zlib
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch.utils.data import DataLoader, Dataset
+
+from nlt.data.datamodule import LightTransportDataModule
+from nlt.data.dataset import LightTransportDataset
+from nlt.data.sample import MATERIALS, POINT_FIELDS, Field
+from nlt.data.spec import DatasetSpec
+from nlt.data.store import points_name, write_manifest, write_shard
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
+from nlt.paths import find_config
+
+
+def synthetic(spec: DatasetSpec, root: str) -> Path:
+    """A dataset of random numbers in the form that `spec` says; its directory."""
+    rng, sizes, directory = np.random.default_rng(0), spec.sizes, Path(str(spec.directory(root)))
+
+    def array(field: Field) -> np.ndarray:
+        shape = field.resolve(sizes)
+        if field.dtype == "bool":
+            return rng.random(shape) < 0.9
+        return np.asarray(rng.random(shape, np.float32) * (1 if field.dtype.startswith("float") else 2), field.dtype)
+
+    for scene in range(len(spec.scenes)):
+        points = {name: array(field) for name, field in POINT_FIELDS.items()}
+        points["object"] = rng.integers(-1, sizes["M"], sizes["N"], np.int32)
+        points["material"] = rng.integers(0, len(MATERIALS), sizes["N"], np.uint8)
+        write_shard(directory / points_name(scene), [points])
+    for shard in spec.shards():
+        fields = spec.fields(shard.split)
+        cameras = {
+            "camera_matrix": np.array([[spec.resolution, 0, spec.resolution / 2]] * 2 + [[0, 0, 1]], np.float32),
+            "world_to_view": np.eye(4, dtype=np.float32),
+        }
+        cameras["camera_matrix"][1] = [0, spec.resolution, spec.resolution / 2]
+        rows = range(shard.start, shard.stop)
+        write_shard(directory / shard.name, [{n: array(f) for n, f in fields.items()} | cameras for _ in rows])
+    write_manifest(directory, spec, "synthetic")
+    return directory
+
+
+def build(method: str, spec: DatasetSpec, width: int) -> Method:
+    """A method with random weights."""
+    model: Any = yaml.safe_load(find_config("model", method).read_text())["model"]
+    kind: Any = pydoc.locate(model["class_path"])
+    more = {"width": width, "num_scenes": len(spec.scenes), "num_points": spec.points}
+    return kind(**model.get("init_args", {}), **(more if issubclass(kind, RenderingModule) else {}))
+
+
+class Bare(Dataset):
+    """`nbytes` of a file and their CRC, for every sample."""
+
+    def __init__(self, file: Path, nbytes: int, count: int) -> None:
+        self.file, self.nbytes, self.count = file, nbytes, count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> int:
+        return zlib.crc32(np.fromfile(self.file, np.uint8, self.nbytes, offset=index * self.nbytes).data)
+
+
+def rate(loader: DataLoader, samples: int) -> float:
+    """Samples per second of one pass, once the processes are up."""
+    iterator = iter(loader)
+    next(iterator)
+    start = time.perf_counter()
+    batches = sum(1 for _ in iterator)
+    assert loader.batch_size
+    return min(batches * loader.batch_size, samples) / (time.perf_counter() - start)
+
+
+def cpu_ms(dataset: LightTransportDataset, batch: int) -> float:
+    """Least processor time of a sample, in batches, in this process."""
+    times = []
+    for start in range(0, len(dataset) - batch + 1, batch):
+        before = os.times()
+        dataset.__getitems__(list(range(start, start + batch)))
+        after = os.times()
+        times.append(after.user + after.system - before.user - before.system)
+    return 1e3 * min(times) / batch
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--methods", nargs="+", default=["cnn", "nlt_photons"])
+    parser.add_argument("--resolution", type=int, default=256)
+    parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/loading.json"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    spec = DatasetSpec(["living_room"], resolution=options.resolution, train=options.samples, val=0, test=0)
+    report: dict[str, Any] = {"options": {k: str(v) for k, v in vars(options).items()}, "methods": {}}
+    report["manifest"] = origin() | surroundings(torch.device("cpu"))
+    with tempfile.TemporaryDirectory() as folder:
+        directory = synthetic(spec, folder)
+        for method in options.methods:
+            inputs = build(method, spec, 8).inputs
+            module = LightTransportDataModule(spec, folder, options.batch, options.workers)
+            dataset = LightTransportDataset(directory, spec, "train", inputs)
+            module.directory = directory
+            module.split = partial(lambda dataset, name: dataset, dataset)  # type: ignore[method-assign]
+            sizes, stored = spec.sizes, spec.fields("train")
+            nbytes = sum(stored[name].nbytes(sizes) for name in dataset._stored)
+            file = Path(folder) / f"{method}.bin"
+            file.write_bytes(np.random.default_rng(0).bytes(nbytes * options.samples))
+            bare = DataLoader(Bare(file, nbytes, options.samples), options.batch, num_workers=options.workers,
+                              persistent_workers=options.workers > 0)  # fmt: skip
+            loader = module.train_dataloader()
+            loads, ceilings = [], []
+            for _ in range(options.turns):
+                loads.append(rate(loader, options.samples))
+                ceilings.append(rate(bare, options.samples))
+            row = {
+                "samples_per_second": statistics.median(loads),
+                "best_samples_per_second": max(loads),
+                "ceiling_samples_per_second": statistics.median(ceilings),
+                "ratio_to_ceiling": statistics.median(a / b for a, b in zip(loads, ceilings, strict=True)),
+                "bytes_per_sample": nbytes,
+                "cpu_ms_per_sample": cpu_ms(dataset, options.batch),
+            }
+            report["methods"][method] = row
+            print(method, ", ".join(f"{key} {value:,.4g}" for key, value in row.items()), flush=True)
+            file.unlink()
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
