@@ -29,6 +29,7 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.evaluation import judge
 from nlt.evaluation.frames import Frames
+from nlt.evaluation.paper import published
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.metrics import feature_cache, image_metrics
 from nlt.metrics.inception import Inception, _read_model, find_weights, load_inception
@@ -104,8 +105,8 @@ def before_and_after(turns: int = 2) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    nine = [name for name in config_names("model") if "/" not in name and not name.startswith(("path", "oidn"))]
-    parser.add_argument("--methods", nargs="+", default=nine, help="default: all trained ones")
+    nine = [name for name in config_names("model") if published("table1", name)]
+    parser.add_argument("--methods", nargs="+", default=nine, help="default: the paper's nine")
     parser.add_argument("--views", type=int, default=256)
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--width", type=int, default=16)
