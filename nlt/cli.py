@@ -60,7 +60,8 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.comparison import Comparison
 
         comparison = Comparison.load(options.config, options.scale, options.data, options.methods, options.seeds)
-        compare(comparison, options.out, options.workers, options.scheduler, dict(options.slurm))
+        slurm = dict(options.slurm)
+        compare(comparison, options.out, options.workers, options.scheduler, slurm, options.train_images)
     elif options.command == "bench":
         _bench(options)
     elif options.command == "report":
@@ -142,6 +143,10 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
     compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
+    compare.add_argument(
+        "--train-images", nargs="+", type=_positive, default=[], metavar="N",
+        help="train every method on the first N images of each scene, too: for the learning curves",
+    )  # fmt: skip
     _add_scheduler(compare, "trainings side by side (default: in turn; on a cluster as `nlt generate`)")
     _add_bench(commands.add_parser("bench", help="what a frame, a training step and a sample cost, stage by stage"))
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")

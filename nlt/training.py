@@ -34,6 +34,7 @@ _NOISE = (
     ".*GPU available but not used.*",
     ".*LightningCLI's args parameter.*",
     ".*The dirpath has changed.*",
+    ".*callbacks used to create the checkpoint need to be provided.*",
     ".*Checkpoint directory .* exists and is not empty.*",
 )
 # Checkpoints that Lightning finds by itself.

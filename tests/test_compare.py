@@ -28,7 +28,7 @@ from nlt.data import engines
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import clock, compare, comparison, progress
+from nlt.evaluation import clock, compare, comparison, learning_curves, progress
 from nlt.evaluation.dashboard import write_logs
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.gallery import Shown, worst_pixels
@@ -457,6 +457,73 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
 )
 def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
     assert comparison.Comparison.load("table2", scale, data, None).name == name
+
+
+def test_history(world, more_methods):
+    """The validation metrics along each training, as they were logged; also of one that was killed."""
+    with (world.folder / "out/history.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == set(world.rows) - set(UNTRAINED)
+    more_methods("KilledOnce")
+    (world.folder / "killed").unlink(missing_ok=True)
+    shutil.rmtree(world.run("killedonce"), ignore_errors=True)
+    world.compare("--methods", "killedonce", "cnn", out="history")
+    with (world.folder / "history/history.csv").open(newline="") as file:
+        again = list(csv.DictReader(file))
+    for method, found in (("nlt", rows), ("killedonce", again), ("cnn", again)):
+        mine = [row for row in found if row["method"] == method]
+        assert [(row["step"], row["images_seen"], row["seed"]) for row in mine] == [("4", "8", "3")]
+        logs = [EventAccumulator(str(path)).Reload() for path in world.run(method).glob("events.out.tfevents.*")]
+        for key in ("loss", "mse", "mssim"):
+            logged = [
+                event.value
+                for log in logs
+                if f"val/{key}" in log.Tags()["scalars"]
+                for event in log.Scalars(f"val/{key}")
+            ]
+            assert [float(row[key]) for row in mine] == pytest.approx(logged)
+        assert 0 < float(mine[0]["train_s"]) < world.took(method)["train_s"]
+
+
+def test_training_images(world, trainings, capfd):
+    """Trained on fewer, as long; beside what the table's own training saw."""
+    world.compare("--methods", "cnn", "path_tracing_1", "--train-images", "3", "8", out="fewer")
+    assert [(job.method, job.train_images) for job in trainings] == [("cnn", 3)]
+    rows = load(world.folder / "fewer").rows("training_images.csv")
+    assert [(row["method"], row["train_images"], row["status"]) for row in rows] == [("cnn", 8, "ok"), ("cnn", 3, "ok")]
+    assert rows[0]["mse"] == float(world.rows["cnn"]["mse"]) != rows[1]["mse"] > 0
+    assert trainings[0].took["steps"] == STEPS and (world.folder / "fewer/table.csv").read_text().count("\ncnn,") == 1
+    assert main(["compare", "--config", str(world.config), "--methods", "cnn", "--train-images", "9"]) == 2
+    assert "--train-images: 9 is more than data.dataset.train, 8" in capfd.readouterr().err
+
+
+def test_learning_curves(tmp_path, monkeypatch):
+    """A line per method through the means over seeds, a band where there are several; nothing of what diverged."""
+    results = make_results(tmp_path, papers_numbers("table2"), "table2", seeds=2)
+    drawn = []
+    monkeypatch.setattr(learning_curves, "save", lambda figure, *_: drawn.append(figure))
+    learning_curves.draw_learning_curves(results)
+    assert not drawn
+    rows = [
+        {"method": method, "seed": seed, "images_seen": 100 * k, "mse": 1 / (k + seed), "loss": 3.0}
+        for method, seeds in (("denoising_1_4", (0,)), ("nlt", (0, 1)))
+        for seed in seeds
+        for k in (1, 2, 4)
+    ]
+    write_rows(tmp_path / "history.csv", rows)
+    lost = {"method": "nlt", "seed": 0, "train_images": 100, "status": "diverged"}
+    good = {"method": "nlt", "seed": 0, "train_images": 400, "status": "ok", "mse": 0.25, "fid": 20.0}
+    write_rows(tmp_path / "training_images.csv", [lost, good])
+    learning_curves.draw_learning_curves(results)
+    first, unused, few, fid = drawn[0].axes
+    lines = {line.get_label(): line.get_xydata().T.tolist() for line in first.lines}
+    assert lines == {
+        "Denoising (1/4)": [[100, 200, 400], [1, 1 / 2, 1 / 4]],
+        "Ours (w/o photons)": [[100, 200, 400], pytest.approx([3 / 4, 5 / 12, 9 / 40])],
+    }
+    assert len(first.collections) == 1 and not unused.axison
+    assert [line.get_xydata().tolist() for axis in (few, fid) for line in axis.lines] == [[[400, 0.25]], [[400, 20]]]
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == list(lines)
 
 
 def test_seeds(world, trainings):

@@ -285,6 +285,10 @@ def test_epoch_sampler():
     assert orders[0] == orders[2] != orders[1] and orders[0][0] != sorted(orders[0][0])
     assert list(EpochSampler(23, 0, 2, True, 6)) != orders[0][0]
 
+    order = list(EpochSampler(10, 0, 1, True, 5, distinct=4))
+    assert sorted(order[:4]) == sorted(order[4:8]) == list(range(4)) and order[:4] != order[4:8]
+    assert len(order) == 10 and len(set(order[8:])) == 2
+
 
 def test_loader_errors(dataset):
     module = LightTransportDataModule(spec_of(), str(dataset.parent), batch_size=13, workers=0)
@@ -313,3 +317,18 @@ def test_two_scenes(tmp_path):
     assert batch["scene"][order].tolist() == [0, 0, 1, 1] and batch["exposure"][order].tolist() == [2, 2, 0.5, 0.5]
     assert batch["translation"].shape == (4, 1, 3) and not batch["present"][order][:2].any()
     assert module.num_scenes == 2 and "one+two" in str(module.directory)
+
+    few = LightTransportDataModule(spec, str(tmp_path), batch_size=4, workers=0, train_images=1)
+    few.setup("fit")
+    (again,) = few.train_dataloader()  # as many steps; the first sample of each scene, twice
+    first = {0: order[0], 1: order[2]}
+    assert sorted(again["scene"].tolist()) == [0, 0, 1, 1]
+    for scene, noisy in zip(again["scene"].tolist(), again["noisy"], strict=True):
+        assert torch.equal(noisy, batch["noisy"][first[scene]])
+    assert len(few.split("val")) == 2
+
+
+@pytest.mark.parametrize("more", [{"train_images": 0}, {"train_images": 13}, {"train_images": 4, "online": True}])
+def test_train_images_that_are_not_there(more):
+    with pytest.raises(UserError, match=r"data.train_images: must be 1 to data.dataset.train \(12\)"):
+        LightTransportDataModule(spec_of(), **more)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import lightning as L
@@ -27,6 +28,7 @@ class LightTransportDataModule(L.LightningDataModule):
         seed: of the shuffling; online, of which samples there are.
         online: render the training samples while training, each for one step alone, and store none. An epoch is
             as many as `dataset.train` says; validation and test samples are generated and stored as ever.
+        train_images: train on the first so many of each scene's samples alone; an epoch has as many steps as with all.
     """
 
     def __init__(
@@ -37,14 +39,20 @@ class LightTransportDataModule(L.LightningDataModule):
         workers: int = 1,
         seed: int = 0,
         online: bool = False,
+        train_images: int | None = None,
     ) -> None:
         super().__init__()
         if online and workers < 1:
             raise UserError(f"data.workers: must be at least 1, is {workers}: with data.online, they render")
         if batch_size < 1:
             raise UserError(f"data.batch_size: must be at least 1, is {batch_size}")
+        if train_images is not None and (online or not 1 <= train_images <= dataset.train):
+            raise UserError(
+                f"data.train_images: must be 1 to data.dataset.train ({dataset.train}), and not with data.online, "
+                f"is {train_images}"
+            )
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
-        self.online, self.passes = online, 0
+        self.online, self.passes, self.train_images = online, 0, train_images
         self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
 
@@ -93,17 +101,20 @@ class LightTransportDataModule(L.LightningDataModule):
             devices = self.trainer.num_devices if self.trainer else 1
             threads = max(1, cores() // (self.workers * devices))
             return OnlineDataset(self.directory, self.stored, inputs, self.num_scenes * self.spec.train, threads)
-        return LightTransportDataset(self.directory, self.stored, name, inputs)
+        few = name == "train" and self.train_images
+        spec = dataclasses.replace(self.stored, train=few) if few else self.stored
+        return LightTransportDataset(self.directory, spec, name, inputs)
 
     def _loader(self, name: str) -> DataLoader:
         dataset, training = self.split(name), name == "train"
         rank, processes = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         if len(dataset) == 0:
             raise UserError(f"data.dataset.{name}: is 0; this command needs {name} samples")
-        if training and len(dataset) // processes < self.batch_size:
-            raise UserError(f"data.batch_size: {self.batch_size} is more than the {len(dataset)} training samples")
+        length = self.num_scenes * self.spec.train if training else len(dataset)
+        if training and length // processes < self.batch_size:
+            raise UserError(f"data.batch_size: {self.batch_size} is more than the {length} training samples")
         online = training and self.online
-        sampler: Sampler[int] = EpochSampler(len(dataset), rank, processes, training, self.seed)
+        sampler: Sampler[int] = EpochSampler(length, rank, processes, training, self.seed, len(dataset))
         if online:
             sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
         return DataLoader(

@@ -127,11 +127,15 @@ class EpochSampler(Sampler[int]):
     """This process's part of the dataset: shuffled by (seed, epoch) alone, so that a resumed run continues it.
 
     While training, every process gets equally many samples and what is left over is dropped; at evaluation,
-    each sample is seen once by exactly one process.
+    each sample is seen once by exactly one process. `distinct`: samples that there are, if less than the epoch's
+    `length`: all come again, in another order, until it is full.
     """
 
-    def __init__(self, length: int, rank: int, processes: int, shuffle: bool, seed: int) -> None:
+    def __init__(
+        self, length: int, rank: int, processes: int, shuffle: bool, seed: int, distinct: int | None = None
+    ) -> None:
         self.length, self.rank, self.processes, self.shuffle, self.seed = length, rank, processes, shuffle, seed
+        self.distinct = distinct or length
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -146,7 +150,9 @@ class EpochSampler(Sampler[int]):
     def __iter__(self) -> Iterator[int]:
         order = np.arange(self.length)
         if self.shuffle:
-            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
+            rng = np.random.default_rng([self.seed, self.epoch])
+            rounds = [rng.permutation(self.distinct) for _ in range(0, self.length, self.distinct)]
+            order = np.concatenate(rounds)[: self.length]
         return iter(order[self.rank :: self.processes][: len(self)].tolist())
 
 

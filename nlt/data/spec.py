@@ -23,7 +23,7 @@ from nlt.scenes.state import SceneState, sample_state
 FORMAT = 2  # of the files on disk
 # Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
 SECTIONS = ("data", "model", "trainer", "seed_everything")
-DATA = ("dataset", "root", "batch_size", "workers", "seed", "online")
+DATA = ("dataset", "root", "batch_size", "workers", "seed", "online", "train_images")
 _DRAWS = 1000  # of a state that no other split has
 
 

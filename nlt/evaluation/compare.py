@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Died
@@ -21,8 +24,10 @@ from nlt.evaluation.report import draw
 from nlt.evaluation.results import (
     DIVERGED,
     FAILED,
+    HISTORY,
     OK,
     RUNS,
+    TRAINING_IMAGES,
     VIEWS,
     load,
     write_images,
@@ -32,7 +37,11 @@ from nlt.evaluation.results import (
 )
 from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.evaluation.trainings import Training, check, train
+from nlt.metrics.quantities import METRICS
+from nlt.models.module import RenderingModule
 from nlt.models.policy import default_device
+
+_ROW = ("method", "seed", "train_images", "status", "message")  # of training_images.csv, before its metrics
 
 
 def compare(
@@ -41,25 +50,35 @@ def compare(
     workers: int | None = None,
     scheduler: str = "local",
     slurm: Mapping[str, str] | None = None,
+    train_images: Sequence[int] = (),
 ) -> Path:
     """Everything that a table needs, of which what is there already is kept. Returns its directory.
 
     Args:
         workers: trainings side by side (default: on this machine in turn).
         scheduler, slurm: as `nlt.data.engines.find_engine`, for generation and trainings; the rest is done here.
+        train_images: train every method on the first so many images of each scene, too.
     """
     start, begun = time.time(), origin()
     directory = Path(out or Path("results") / comparison.name)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
         raise UserError(f"{comparison.scale}: data.dataset.test: is 0; a comparison needs test samples")
+    for count in train_images:
+        if count > spec.train:
+            raise UserError(f"--train-images: {count} is more than data.dataset.train, {spec.train}")
     jobs = comparison.jobs()
     check(comparison)
     dataset = generate(spec, root, workers, scheduler, slurm)
     trainings = {
-        job: Training.of(comparison, *job, Path("runs") / dataset.name) for job in jobs if not untrained(job[0])
+        (*job, count): Training.of(comparison, *job, Path("runs") / dataset.name, count)
+        for count in (None, *sorted({*train_images} - {spec.train}))
+        for job in jobs
+        if not untrained(job[0])
     }
     died = train(list(trainings.values()), scheduler, workers, slurm or {})
+    if history := _history(trainings.values()):
+        write_rows(directory / HISTORY, history)
     device = default_device()
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
     test, clock = Evaluation(frames, device), Clock(frames, device)
@@ -71,6 +90,7 @@ def compare(
         "table": comparison.table,
         "methods": comparison.methods,
         "seeds": comparison.seeds,
+        "train_images": sorted(train_images),
         "dataset": dataset.name,
         "scenes": [description.name for description in spec.descriptions],
         "teachers": frames.teachers(),
@@ -82,14 +102,11 @@ def compare(
     views: list[dict[str, Any]] = []
     for number, (method, seed) in enumerate(jobs, 1):
         print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
-        run: dict[str, Any] = {"method": method, "seed": seed, "status": OK, "message": ""}
-        try:
+        run: dict[str, Any] = {"method": method, "seed": seed}
+        with _noted(run):
             module, took = untrained(method), dict[str, Any]()
             if module is None:
-                training = trainings[method, seed]
-                if training in died:
-                    raise Died(died[training])
-                module, took = training.load(device)
+                module, took = _trained(trainings[method, seed, None], died, device)
             metrics, each, radiance = test.evaluate(module)
             run |= clock.time(module) | metrics | clock.size(module) | took
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
@@ -97,14 +114,6 @@ def compare(
             views += [{"method": method, "seed": seed, **row} for row in each]
             if seed == comparison.seeds[0]:
                 write_images(directory, method, radiance=radiance)
-        except DivergedError as error:
-            run |= {"status": DIVERGED, "message": str(error)}
-        except Died as error:
-            run |= {"status": FAILED, "message": str(error)}
-        except (UserError, OSError):
-            raise
-        except Exception as error:  # whatever it is, the other rows go on
-            run |= {"status": FAILED, "message": " ".join(f"{type(error).__name__}: {error}".split())}
         runs.append(run)
         if number == 1:
             print(live_header())
@@ -115,6 +124,50 @@ def compare(
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         write_tables(load(directory))
     print("\n" + "\n".join([live_header(), *(live_row(run) for run in runs)]))
+    # What the table's own trainings saw is a point of the curve, too.
+    images = [{**run, "train_images": spec.train} for run in runs if train_images and not untrained(run["method"])]
+    rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in images]
+    for training in trainings.values():
+        if training.train_images:
+            row = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
+            with _noted(row):
+                row |= test.evaluate(_trained(training, died, device)[0])[0]
+            rows.append(row)
+            print(f"{training.name}: {row['status']} {row['message']}", flush=True)
+    if rows:
+        write_rows(directory / TRAINING_IMAGES, rows)
     draw(directory)
     print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     return directory
+
+
+@contextmanager
+def _noted(row: dict[str, Any]) -> Iterator[None]:
+    """Whatever goes wrong is noted in the row, and the others go on; but for a user's mistake, a full disk."""
+    row |= {"status": OK, "message": ""}
+    try:
+        yield
+    except (DivergedError, Died) as error:
+        row |= {"status": FAILED if isinstance(error, Died) else DIVERGED, "message": str(error)}
+    except (UserError, OSError):
+        raise
+    except Exception as error:
+        row |= {"status": FAILED, "message": " ".join(f"{type(error).__name__}: {error}".split())}
+
+
+def _trained(
+    training: Training, died: Mapping[Training, str], device: torch.device
+) -> tuple[RenderingModule, dict[str, Any]]:
+    if training in died:
+        raise Died(died[training])
+    return training.load(device)
+
+
+def _history(trainings: Iterable[Training]) -> list[dict[str, Any]]:
+    """The rows of history.csv."""
+    return [
+        {"method": training.method, "seed": training.seed, **row}
+        for training in trainings
+        if not training.train_images
+        for row in (training.took or {}).get("history", [])
+    ]

@@ -23,10 +23,28 @@ _WAITING, _TRAINING, _DIED = "waiting", "training", "died"
 
 
 class Progress(L.Callback):
-    """Writes progress.json into the directory `run`, every few seconds at most, and calls `tick` at every step."""
+    """Writes progress.json into the directory `run`, every few seconds at most, and calls `tick` at every step.
+
+    `history`: the validation metrics along the training, with step, images_seen and train_s. It and `seconds`, what
+    the training has taken, are in its checkpoints, so that a resumed one goes on counting.
+    """
 
     def __init__(self, run: Path, tick: Callable[[int], None]) -> None:
         self._file, self._tick = run / PROGRESS, tick
+        self.history: list[dict[str, float]] = []
+        self._start = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Of this training, those that were lost with a process apart."""
+        return time.monotonic() - self._start
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"history": self.history, "seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.history = state_dict["history"]
+        self._start -= state_dict["seconds"]
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._first, self._begun = trainer.global_step, time.monotonic()
@@ -39,6 +57,11 @@ class Progress(L.Callback):
 
     def on_validation_batch_end(self, *_: Any) -> None:
         self._tick(0)
+
+    def on_validation_end(self, trainer: L.Trainer, *_: Any) -> None:
+        metrics = {k.removeprefix("val/"): float(v) for k, v in trainer.callback_metrics.items() if k[:4] == "val/"}
+        images = images_seen(trainer)
+        self.history.append({"step": trainer.global_step, "images_seen": images, "train_s": self.seconds, **metrics})
 
     def _write(self, trainer: L.Trainer) -> None:
         self._written = time.monotonic()
@@ -53,6 +76,11 @@ class Progress(L.Callback):
         """Say of what."""
         message = " ".join(f"{type(error).__name__}: {error}".split())
         write_bytes(self._file, json.dumps({"state": _DIED, "message": message}).encode())
+
+
+def images_seen(trainer: L.Trainer) -> int:
+    """By all optimiser steps and devices so far."""
+    return trainer.global_step * trainer.datamodule.batch_size * trainer.world_size  # type: ignore[attr-defined]
 
 
 @dataclass

@@ -7,6 +7,7 @@ from pathlib import Path
 from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
 from nlt.evaluation.gallery import Shown, draw_failures, draw_qualitative
+from nlt.evaluation.learning_curves import draw_learning_curves
 from nlt.evaluation.page import write_page
 from nlt.evaluation.results import load
 from nlt.evaluation.tables import write_tables
@@ -25,6 +26,7 @@ def draw(directory: str | Path) -> None:
         print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
     draw_samples(results)
     draw_speed_accuracy(results)
+    draw_learning_curves(results)
     if images := Shown.load(results):
         draw_qualitative(images)
         draw_failures(images)

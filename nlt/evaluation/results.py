@@ -12,6 +12,9 @@ results/NAME/ holds
   runs.csv, and with it the tables, are of the manifest's `device`;
 - `views.csv`: a row per method, seed and test view with the metrics of that image. `fid_without` and `kid_without`
   are those of the test set without the view's jackknife group: they carry these metrics' uncertainty;
+- `history.csv`: the validation metrics along each training, with `step`, `images_seen` and `train_s` so far;
+- `training_images.csv`, if it was asked for: the test metrics of each method and seed when it is trained, as long, on
+  the first `train_images` of each scene alone; with the table's own;
 - `images/METHOD.npz`, not in git: `radiance` (V, 3, H, W), float16, linear, of the first seed, for the shown views.
   `images/reference.npz` also has `exposure` (V,) and `view` (V,); `images/noisy.npz` is the teaching input, and
   `images/gbuffer.npz` has `albedo` and `normal` (V, 3, H, W), `depth` (V, 1, H, W), `transmits` (V, H, W)
@@ -41,6 +44,7 @@ from nlt.errors import UserError
 from nlt.metrics.quantities import QUANTITIES, STAGES
 
 MANIFEST, RUNS, TIMINGS, VIEWS, IMAGES = "manifest.json", "runs.csv", "timings.csv", "views.csv", "images"
+HISTORY, TRAINING_IMAGES = "history.csv", "training_images.csv"
 OK, DIVERGED, FAILED = "ok", "diverged", "failed"
 LEVEL, _RESAMPLES = 0.95, 2000
 # What the clock measures.
@@ -142,6 +146,11 @@ class Results:
         commit = next(row["commit"] for row in rows.values())
         manifest = {**self.manifest, "device": device, "commit": commit, "uncommitted_changes": False}
         return dataclasses.replace(self, manifest=manifest, runs=runs, timings=[])
+
+    def rows(self, name: str) -> list[dict[str, Any]]:
+        """Those of history.csv or training_images.csv; none where there is no such file."""
+        path = self.directory / name
+        return read_rows(path) if path.exists() else []
 
     def images(self, name: str) -> dict[str, np.ndarray] | None:
         """The arrays of images/`name`.npz: a method, "reference", "noisy" or "gbuffer"; None where there is none."""

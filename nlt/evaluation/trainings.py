@@ -6,7 +6,6 @@ import fcntl
 import hashlib
 import json
 import os
-import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -18,10 +17,10 @@ import yaml
 
 from nlt.data.engines import find_engine
 from nlt.data.files import write_bytes
-from nlt.data.spec import read_configs
+from nlt.data.spec import merge, read_configs
 from nlt.errors import DivergedError, UserError, as_mistake
 from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.progress import DONE, Progress, ProgressTable
+from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
 from nlt.evaluation.provenance import origin
 from nlt.models.module import RenderingModule
 from nlt.training import PRECISIONS, check_configs, newest_checkpoint, run_lightning, trainer_defaults
@@ -29,7 +28,7 @@ from nlt.training import PRECISIONS, check_configs, newest_checkpoint, run_light
 
 @dataclass(frozen=True)
 class Training:
-    """A job: a method's training with a seed.
+    """A job: a method's training with a seed, on all training images or the first `train_images` of each scene.
 
     Its directory `run` belongs to a hash of all that decides the outcome, so a method is trained anew only when that
     changed. There lie its checkpoints, its log, how far it is, and, once it has come to an end, what it took.
@@ -40,23 +39,34 @@ class Training:
     run: Path
     files: tuple[str, ...]
     precision: str
+    train_images: int | None = None
 
     @classmethod
-    def of(cls, comparison: Comparison, method: str, seed: int, root: Path) -> Training:
+    def of(
+        cls, comparison: Comparison, method: str, seed: int, root: Path, train_images: int | None = None
+    ) -> Training:
         """A comparison's training, in a directory below `root`."""
         files = comparison.configs(method)
         merged = read_configs(files)
+        if train_images:
+            merged = merge(merged, {"data": {"train_images": train_images}})
         # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
         precisions = dict.fromkeys((trainer_defaults()["precision"], *PRECISIONS))
         runs = {precision: root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions}
         precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
         # Absolute: processes elsewhere have other working directories.
         paths = tuple(os.path.abspath(file) for file in files)
-        return cls(method, seed, runs[precision].absolute(), paths, precision)
+        return cls(method, seed, runs[precision].absolute(), paths, precision, train_images)
+
+    @property
+    def name(self) -> str:
+        """As it is printed."""
+        images = f", {self.train_images} images" if self.train_images else ""
+        return f"{self.method}, seed {self.seed}{images}"
 
     @property
     def took(self) -> dict[str, Any] | None:
-        """What it took, or how it diverged; None if it has not come to an end."""
+        """What it took, or how it diverged, and its `history` (progress.py); None if it has not come to an end."""
         done = self.run / DONE
         took = json.loads(done.read_text()) if done.exists() else None
         return took if took and ("diverged" in took or newest_checkpoint(self.run)) else None
@@ -68,6 +78,7 @@ class Training:
             DivergedError: it diverged, now or when it was tried before.
         """
         took, checkpoint = self.took or {}, newest_checkpoint(self.run)
+        took.pop("history", None)
         if "diverged" in took:
             raise DivergedError(took["diverged"])
         assert checkpoint is not None
@@ -98,7 +109,7 @@ def train(
     if not left:
         return died
     engine = find_engine(scheduler, workers or (1 if scheduler == "local" else None), slurm, preload=(__name__,))
-    table = ProgressTable({t.run: f"{t.method}, seed {t.seed}" for t in left})
+    table = ProgressTable({t.run: t.name for t in left})
     print(f"\n{len(left)} of {len(trainings)} trainings to do, {engine.workers} side by side", flush=True)
     with closing(engine.run(_train, left, died)) as ticks:
         for _ in ticks:
@@ -134,7 +145,7 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
         except Exception as error:
             progress.died(error)
             raise
-        write_bytes(run / DONE, json.dumps(took).encode())
+        write_bytes(run / DONE, json.dumps({**took, "history": progress.history}).encode())
 
 
 def _key(config: dict[str, Any], seed: int, precision: str) -> str:
@@ -152,13 +163,11 @@ def _fit(training: Training, progress: Progress) -> dict[str, Any]:
     if checkpoint:
         print(f"resuming from {checkpoint}", flush=True)
         arguments.append(f"--ckpt_path={checkpoint}")
-    begin = time.time()
-    cli = run_lightning(arguments, [progress])
-    steps = cli.trainer.global_step
+    trainer = run_lightning(arguments, [progress]).trainer
     return {
-        "train_s": time.time() - begin,
-        "steps": steps,
-        "images_seen": steps * cli.datamodule.batch_size * cli.trainer.world_size,
+        "train_s": progress.seconds,
+        "steps": trainer.global_step,
+        "images_seen": images_seen(trainer),
         "trained_at_commit": origin()["commit"],
         "resumed": checkpoint is not None,
     }
@@ -171,12 +180,11 @@ def _run_config(training: Training) -> dict[str, Any]:
     return {
         "seed_everything": training.seed,
         "model": {"init_args": {"seed": training.seed}},
-        "data": {"seed": training.seed},
+        "data": {"seed": training.seed} | ({"train_images": training.train_images} if training.train_images else {}),
         "trainer": {
+            # Not what a machine elsewhere would choose: the directory belongs to this one.
+            "precision": trainer.get("precision", training.precision),
             # Side by side are jobs; and Lightning's processes for more devices would run the whole command.
-            "precision": trainer.get(
-                "precision", training.precision
-            ),  # not what a machine elsewhere would choose: the directory is of this one
             "devices": trainer.get("devices", 1),
             "enable_model_summary": False,
             "enable_progress_bar": False,
