@@ -466,7 +466,8 @@ def test_history(world, more_methods):
     assert {row["method"] for row in rows} == set(world.rows) - set(UNTRAINED)
     more_methods("KilledOnce")
     (world.folder / "killed").unlink(missing_ok=True)
-    shutil.rmtree(world.run("killedonce"), ignore_errors=True)
+    for run in world.folder.glob("runs/*/killedonce-*"):
+        shutil.rmtree(run)
     world.compare("--methods", "killedonce", "cnn", out="history")
     with (world.folder / "history/history.csv").open(newline="") as file:
         again = list(csv.DictReader(file))
