@@ -1,6 +1,7 @@
 """Generation: the same bytes however often interrupted, wherever it runs and wherever it writes to."""
 
 import errno
+import multiprocessing
 import os
 import shutil
 import signal
@@ -140,12 +141,12 @@ def test_worker_killed_twice(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("preload", [(), ("json",)])
 def test_nothing_outlives_a_killed_command(preload, tmp_path):
-    """Its processes end, forked ones too."""
+    """Its processes end, forked ones too; what these start, they start as ever."""
     (tmp_path / "beating.py").write_text(
-        "import time\nfrom pathlib import Path\n"
+        "import multiprocessing\nimport time\nfrom pathlib import Path\n"
         "def beat(job, threads, tick):\n"
         "    while True:\n"
-        "        Path(job).write_text(str(time.time()))\n"
+        "        Path(job).write_text(f'{multiprocessing.get_start_method()} {time.time()}')\n"
         "        tick(1)\n"
         "        time.sleep(0.02)\n"
     )
@@ -163,6 +164,7 @@ def test_nothing_outlives_a_killed_command(preload, tmp_path):
         assert len(seen) < 20
         seen.append(beat.read_text())
         time.sleep(1)
+    assert seen[-1].startswith(multiprocessing.get_start_method())
 
 
 # ---- nothing is compiled twice --------------------------------------------------------------------------

@@ -225,6 +225,7 @@ def _work(content: bytes, threads: int, counter: Any) -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     _allow_children()
+    multiprocessing.set_start_method(None, force=True)  # else loaders' processes would start as this one did, slowly
 
     def tick(samples: int) -> None:
         if not parent.is_alive():
