@@ -218,3 +218,11 @@ def test_mistakes(arguments, more, words, tmp_path, capfd):
 def test_another_methods_checkpoint(arguments, checkpoint, tmp_path, capfd):
     assert main([*arguments[:5], "--methods", "nlt", "--ckpt", str(checkpoint), "--out", str(tmp_path)]) == 2
     assert "CNN" in capfd.readouterr().err
+
+
+def test_a_checkpoint_gives_weights_and_size(arguments, checkpoint, tmp_path):
+    run = bench._Bench(tmp_path, arguments[2], arguments[4], ["cnn"], {"width": "7"}, str(checkpoint), "cpu", 1.0, [])
+    saved = torch.load(checkpoint, weights_only=True)
+    assert run.settings["width"] == saved["architecture"]["width"] == 2
+    weights = run.method("cnn", run.settings).state_dict()
+    assert all(torch.equal(weights[name], value) for name, value in saved["state_dict"].items())

@@ -69,7 +69,7 @@ def _markdown(manifest: Row, of_kind: Any) -> str:
         "",
         f"Milliseconds of a batch of {settings['batch']}: median, in brackets the 95th percentile. Plain: eager, "
         "float32, contiguous NCHW, nothing cached; the same frames, taking turns. Ratio: plain over usual, of "
-        "transport, projection and synthesis, frame by frame: median, and 5th to 95th percentile.",
+        "transport, projection and synthesis, frame by frame: median, 5th to 95th percentile; of each path's fastest.",
         "",
         *_frames(of_kind("frame"), ceilings),
         *_training(of_kind("training")),
@@ -99,7 +99,12 @@ def _frames(rows: list[Row], ceilings: Row) -> list[str]:
         cells.append(f"{_ms(row, 'time_per_frame_s')} ({_ms(row, 'time_per_frame_p95_s')})")
         ratio = row.get("speedup")
         cells.append(_ms(row["plain"], "time_per_frame_s") if ratio else "–")
-        cells.append(f"{ratio['median']:.2f} ({ratio['p5']:.2f} to {ratio['p95']:.2f})" if ratio else "–")
+        spread = (
+            f"{ratio['median']:.2f} ({ratio['p5']:.2f} to {ratio['p95']:.2f}); {ratio['of_least']:.2f}"
+            if ratio
+            else "–"
+        )
+        cells.append(spread)
         cells.append(f"{row['peak_memory_bytes'] / 2**20:.0f}" if "peak_memory_bytes" in row else "–")
         table.append([label(row["method"]), *cells, str(row["timed_frames"])])
         if ratio:
@@ -228,7 +233,8 @@ def _draw_growth(directory: Path, rows: list[Row], settings: Row) -> None:
             for row in (row for row in mine if "skipped" in row):
                 skipped = True
                 axis.plot(row["value"], 0.95, "kx", ms=6, transform=axis.get_xaxis_transform())
-            values = [row["value"] for row in mine]
+            base = settings[factor]  # labelled, and what is too near to it not
+            values = [v for v in (row["value"] for row in mine) if v == base or not 0.6 < v / base < 1.7]
             axis.set_xticks(values, [f"{v // 1000}k" if v >= 1000 and v % 1000 == 0 else str(v) for v in values])
             axis.tick_params(labelsize=7)
             axis.minorticks_off()
