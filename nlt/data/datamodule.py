@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import lightning as L
@@ -12,6 +13,7 @@ from torch.utils.data import DataLoader, Sampler
 from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, collated
 from nlt.data.engines import cores
 from nlt.data.files import AnyPath
+from nlt.data.loader import ThreadLoader
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import check_dataset
 from nlt.errors import UserError
@@ -24,7 +26,7 @@ class LightTransportDataModule(L.LightningDataModule):
         dataset: what it holds; `nlt generate` makes it.
         root: directory or fsspec URL of datasets.
         batch_size: samples per step and process (paper: 32, static scenes 128).
-        workers: processes that load, or render.
+        workers: threads that load; online, processes that render.
         seed: of the shuffling; online, of which samples there are.
         online: render the training samples while training, each for one step alone, and store none. An epoch is
             as many as `dataset.train` says; validation and test samples are generated and stored as ever.
@@ -117,16 +119,16 @@ class LightTransportDataModule(L.LightningDataModule):
         sampler: Sampler[int] = EpochSampler(length, rank, processes, training, self.seed, len(dataset))
         if online:
             sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
-        return DataLoader(
+        # Rendering needs processes, for Mitsuba; it starts threads, which a fork would lose. No leak: the memory of one
+        # scene's renderer stays.
+        kind = partial(DataLoader, multiprocessing_context="spawn", persistent_workers=True) if online else ThreadLoader
+        return kind(
             dataset,
             batch_size=self.batch_size,
             sampler=sampler,
             drop_last=training,
             collate_fn=collated,
             num_workers=self.workers,
-            # Rendering starts threads, which a fork would lose. No leak: the memory of one scene's renderer stays.
-            multiprocessing_context="spawn" if online else None,
-            persistent_workers=self.workers > 0,
             pin_memory=torch.cuda.is_available(),
         )
 

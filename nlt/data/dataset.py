@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler, get_worker_info
+from torch.utils.data import Dataset, Sampler
 
 from nlt.data.files import AnyPath
 from nlt.data.sample import BATCH_FIELDS
@@ -112,12 +111,9 @@ def collated(batch: Any) -> Any:
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:
-    """As torch.stack, halves as float32; in a loader's process right into memory that it shares, as torch's collate."""
-    shape, dtype = (len(tensors), *tensors[0].shape), tensors[0].dtype
-    out = torch.empty(0, dtype=torch.float32 if dtype == torch.float16 else dtype)
-    if get_worker_info():
-        out.set_(torch.UntypedStorage._new_shared(math.prod(shape) * out.itemsize))
-    out.resize_(shape)
+    """As torch.stack, halves as float32."""
+    dtype = tensors[0].dtype
+    out = torch.empty(len(tensors), *tensors[0].shape, dtype=torch.float32 if dtype == torch.float16 else dtype)
     for row, tensor in zip(out, tensors, strict=True):
         row.copy_(tensor)
     return out

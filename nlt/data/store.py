@@ -9,6 +9,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -36,14 +37,14 @@ def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
 
 
 class ShardReader:
-    """Random access to samples; keeps the files it has read mapped into memory. Safe to use after a fork."""
+    """Random access to samples; keeps the files it has read mapped into memory. For threads, and after a fork."""
 
     def __init__(self) -> None:
         self._files: OrderedDict[AnyPath, dict[str, np.ndarray]] = OrderedDict()
-        self._pid = os.getpid()
+        self._pid, self._lock = os.getpid(), Lock()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_files": OrderedDict(), "_pid": -1}
+    def __reduce__(self) -> tuple[type[ShardReader], tuple[()]]:
+        return ShardReader, ()
 
     def read(self, path: AnyPath, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
         """The fields of one sample of a shard: views of the file in memory. A damaged copy of a remote file is fetched
@@ -58,7 +59,8 @@ class ShardReader:
         except UserError:
             if isinstance(path, Path):
                 raise
-        self._files.pop(path, None)
+        with self._lock:
+            self._files.pop(path, None)
         with suppress(FileNotFoundError):  # said by the next line
             local_copy(path, fresh=True)
         return self._read(path, row, fields)
@@ -81,14 +83,15 @@ class ShardReader:
 
     def _open(self, path: AnyPath) -> dict[str, np.ndarray]:
         if self._pid != os.getpid():
-            self._files, self._pid = OrderedDict(), os.getpid()
-        if path not in self._files:
-            with safe_open(local_copy(path), framework="pt") as file:  # which, unlike "numpy", copies nothing
-                self._files[path] = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
-            if len(self._files) > _OPEN_FILES:
-                self._files.popitem(last=False)
-        self._files.move_to_end(path)
-        return self._files[path]
+            self.__init__()  # type: ignore[misc]
+        with self._lock:
+            if path not in self._files:
+                with safe_open(local_copy(path), framework="pt") as file:  # which, unlike "numpy", copies nothing
+                    self._files[path] = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
+                if len(self._files) > _OPEN_FILES:
+                    self._files.popitem(last=False)
+            self._files.move_to_end(path)
+            return self._files[path]
 
 
 def read_points(path: AnyPath) -> dict[str, np.ndarray]:

@@ -67,9 +67,10 @@ class Camera:
 
     def view_directions(self) -> np.ndarray:
         """(3, H, W) float32 view direction map: world, unit, through pixel centres (Sec. Method)."""
-        # As `directions`, in float64, but along rows and columns: every epoch makes one of these for every sample.
+        # As `directions`, but along rows and columns: every epoch makes one of these for every sample.
         focal, centre = np.diag(self.matrix)[:2].astype(float), self.matrix[:2, 2].astype(float)
         x = (np.arange(self.width) + 0.5 - centre[0]) / focal[0]
         y = ((np.arange(self.height) + 0.5 - centre[1]) / focal[1])[:, None]
         right, down, forward = self.rotation.T[..., None, None]
-        return ((right * x + (down * y + forward)) * (1 / np.sqrt(x**2 + (y**2 + 1)))).astype(np.float32)
+        columns, rows = (right * x).astype(np.float32), (down * y + forward).astype(np.float32)
+        return (columns + rows) / np.sqrt((x**2).astype(np.float32) + (y**2 + 1).astype(np.float32))
