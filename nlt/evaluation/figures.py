@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +193,7 @@ def _speed_accuracy(axis: plt.Axes, results: Results, key: str, at: Mapping[str,
         style = {"color": _CURVES[k % len(_CURVES)], "ls": DASHES[k % 4], "marker": "x+."[k % 3]}
         _plot(axis, results, key, found, at, name, style)
         for number, m in enumerate(found):
-            part = label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
+            part = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
             axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
                           fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
     for k, m in enumerate(m for m in results.methods if m not in in_curves):
@@ -234,12 +235,22 @@ def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, fl
 
 
 def curves(results: Results) -> dict[str, list[str]]:
-    """Classes with several methods that path trace: the methods, by what they are called, the cheapest first."""
+    """Sizes of one method, and classes with several methods that path trace: the methods, by what they are called.
+
+    The cheapest comes first.
+    """
     families: dict[str, dict[str, tuple[float, float]]] = {}
+    sizes: dict[str, list[str]] = {}
     for run in results.runs:
-        if run["status"] == OK and run["spp"]:
+        if run["status"] != OK:
+            continue
+        name, at, _ = run["method"].partition("@")
+        if at and run["method"] not in sizes.setdefault(name, []):
+            sizes[name].append(run["method"])
+        elif run["spp"] and not at:
             families.setdefault(run["family"], {})[run["method"]] = (run["spp"], run["pixel_fraction"])
-    curves = {}
+    time = partial(results.mean, key="time_per_frame_s")
+    curves = {f"{label(name)}, sizes": sorted(found, key=time) for name, found in sizes.items() if len(found) > 1}
     for members in families.values():
         if len(members) > 1:
             varied = "spp" if len({spp for spp, _ in members.values()}) > 1 else "pixels traced"

@@ -1,0 +1,129 @@
+"""How small may a model be, and how much of the learned 3D network does a scene need?
+
+    python benchmarks/leaner.py --seeds 3
+    python benchmarks/leaner.py --judge results/leaner results/photon_splat/bedroom
+
+Runs `nlt compare` for five sizes of networks (results/leaner), and for photon splats in three settings and with three
+photon counts (results/photon_splat); each goes on where it ended. Then, from the stored results alone (`--judge`), writes
+leanest.md beside them: the cheapest method that is not worse than the best by more than seeds make methods differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.stats
+
+import nlt.cli
+from nlt.data.files import write_bytes
+from nlt.errors import UserError
+from nlt.evaluation.paper import label
+from nlt.evaluation.results import LEVEL, Results, load
+from nlt.metrics.quantities import METRICS
+
+STUDIES = {  # where results go: arguments of nlt compare
+    "results/photon_splat/living_room": "--config photon_splat",
+    "results/photon_splat/bedroom": "--config photon_splat --data leaner/bedroom",
+    "results/photon_splat/living_room_fixed_lights": "--config photon_splat --data demo_fixed_lights",
+    "results/photon_splat/photon_counts": "--config photon_splat --methods nlt_photons photon_splat "
+    "nlt_photons@photons_1000 photon_splat@photons_1000 nlt_photons@photons_100 photon_splat@photons_100",
+    "results/leaner": "--config leaner",
+}
+KEYS = ("mse", "mssim")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method beside the best of its group; `loss` is the fraction by which its error is larger."""
+
+    method: str
+    value: float
+    time: float
+    parameters: int
+    loss: float
+    enough: bool
+
+
+def rank(results: Results, methods: list[str], key: str) -> tuple[list[Row], float]:
+    """Methods, the cheapest first, and the least loss that is more than seed noise (Fisher's LSD).
+
+    Errors (MSSIM's: 1 - MSSIM) are compared by their logarithms, whose variance over seeds is taken to be every
+    method's and pooled. Test images are the same for all.
+    """
+    errors = {m: results.values(m, key) for m in methods}
+    errors = {m: np.log(v if METRICS[key].direction == "lower" else 1 - v) for m, v in errors.items() if len(v)}
+    freedom = sum(len(v) - 1 for v in errors.values())
+    variance = sum(((v - v.mean()) ** 2).sum() for v in errors.values()) / freedom if freedom else math.nan
+    seeds = min(len(v) for v in errors.values())
+    noise = scipy.stats.t.ppf((1 + LEVEL) / 2, freedom) * math.sqrt(2 * variance / seeds) if freedom else math.nan
+    best = min(v.mean() for v in errors.values())
+    rows = []
+    for m, v in errors.items():
+        sizes = (results.mean(m, "time_per_frame_s"), int(results.mean(m, "parameters")))
+        behind = v.mean() - best
+        rows.append(Row(m, results.mean(m, key), *sizes, math.expm1(behind), not behind > noise))
+    return sorted(rows, key=lambda row: row.time), math.expm1(noise)
+
+
+def groups(results: Results) -> list[list[str]]:
+    """Sizes of one method; if there are none but photon counts, all methods together."""
+    sized: dict[str, list[str]] = {}
+    for method in results.methods:
+        name, _, size = method.partition("@")
+        sized.setdefault(name if size and "_" not in size else "", []).append(method)
+    return list(sized.values())
+
+
+def judge(directory: Path) -> str:
+    """leanest.md of a comparison's results, and its text."""
+    results = load(directory)
+    seeds = len(results.manifest["seeds"])
+    scenes = f"{', '.join(results.manifest['scenes'])} ({results.manifest['dataset'].partition('-')[0]})"
+    lines = [f"# The leanest that loses nothing beyond seed noise: {scenes}", ""]
+    for methods in groups(results):
+        for key in KEYS:
+            rows, noise = rank(results, methods, key)
+            found = next(row for row in rows if row.enough)
+            best = min(rows, key=lambda row: row.loss)
+            metric = METRICS[key]
+            lines += [
+                f"**{metric.label}: {label(found.method)}**, {1e3 * found.time:.1f} ms a frame; the best is "
+                f"{label(best.method)}, {1e3 * best.time:.1f} ms. Below {noise:.0%}, a loss may be noise of {seeds} seeds.",
+                "", f"| method | {metric.label} | loss | beyond noise | time per frame (ms) | parameters |",
+                "|---|---:|---:|---|---:|---:|",
+            ]  # fmt: skip
+            lines += [
+                f"| {label(row.method)} | {row.value:{metric.format}} | {row.loss:.0%} | "
+                f"{'no' if row.enough else 'yes'} | {1e3 * row.time:.1f} | {row.parameters:,} |" for row in rows
+            ]  # fmt: skip
+            lines.append("")
+    lines += ["Loss: of the error (1 - MSSIM for MSSIM) above that of the best. Means over seeds.",
+              f"`python benchmarks/leaner.py --judge {directory}`"]  # fmt: skip
+    text = "\n".join(lines) + "\n"
+    write_bytes(directory / "leanest.md", text.encode())
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", nargs="+", choices=STUDIES, default=list(STUDIES), help="studies to run")
+    parser.add_argument("--judge", nargs="+", metavar="DIR", help="only judge these results")
+    options = parser.parse_args()
+    for directory in options.judge or options.only:
+        if not options.judge:
+            sys.argv = ["nlt", "compare", *STUDIES[directory].split(), f"--seeds={options.seeds}", f"--out={directory}"]
+            nlt.cli.main(sys.argv[1:])
+        print(judge(Path(directory)), flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")
