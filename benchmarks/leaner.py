@@ -4,8 +4,8 @@
     python benchmarks/leaner.py --judge results/leaner results/photon_splat/bedroom
 
 Runs `nlt compare` for five sizes of networks (results/leaner), and for photon splats in three settings and with three
-photon counts (results/photon_splat); each goes on where it ended. Then, from the stored results alone (`--judge`), writes
-leanest.md beside them: the cheapest method that is not worse than the best by more than seeds make methods differ.
+photon counts (results/photon_splat); each goes on where it ended. Then, from the stored results alone (`--judge`),
+writes leanest.md beside them: the cheapest method that is worse than the best by no more than seeds make it differ.
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ def judge(directory: Path) -> str:
     for methods in groups(results):
         for key in KEYS:
             rows, noise = rank(results, methods, key)
-            found = next(row for row in rows if row.enough)
-            best = min(rows, key=lambda row: row.loss)
+            named = lambda row: f"{label(row.method)} ({1e3 * row.time:.1f} ms a frame)"
+            found, best = next(row for row in rows if row.enough), min(rows, key=lambda row: row.loss)
             metric = METRICS[key]
             lines += [
-                f"**{metric.label}: {label(found.method)}**, {1e3 * found.time:.1f} ms a frame; the best is "
-                f"{label(best.method)}, {1e3 * best.time:.1f} ms. Below {noise:.0%}, a loss may be noise of {seeds} seeds.",
+                f"**{metric.label}: {named(found)}.** The best is {named(best)}. "
+                f"A loss below {noise:.0%} may be noise of {seeds} seeds.",
                 "", f"| method | {metric.label} | loss | beyond noise | time per frame (ms) | parameters |",
                 "|---|---:|---:|---|---:|---:|",
             ]  # fmt: skip
@@ -112,13 +112,16 @@ def judge(directory: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=1, help="trainings side by side")
     parser.add_argument("--only", nargs="+", choices=STUDIES, default=list(STUDIES), help="studies to run")
     parser.add_argument("--judge", nargs="+", metavar="DIR", help="only judge these results")
     options = parser.parse_args()
     for directory in options.judge or options.only:
         if not options.judge:
-            sys.argv = ["nlt", "compare", *STUDIES[directory].split(), f"--seeds={options.seeds}", f"--out={directory}"]
-            nlt.cli.main(sys.argv[1:])
+            more = [f"--seeds={options.seeds}", f"--workers={options.workers}", f"--out={directory}"]
+            sys.argv = ["nlt", "compare", *STUDIES[directory].split(), *more]  # as the manifest will have it
+            if code := nlt.cli.main(sys.argv[1:]):
+                sys.exit(code)
         print(judge(Path(directory)), flush=True)
 
 
