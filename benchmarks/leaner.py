@@ -57,16 +57,17 @@ def rank(results: Results, methods: list[str], key: str) -> tuple[list[Row], flo
     """
     errors = {m: results.values(m, key) for m in methods}
     errors = {m: np.log(v if METRICS[key].direction == "lower" else 1 - v) for m, v in errors.items() if len(v)}
-    freedom = sum(len(v) - 1 for v in errors.values())
-    variance = sum(((v - v.mean()) ** 2).sum() for v in errors.values()) / freedom if freedom else math.nan
-    seeds = min(len(v) for v in errors.values())
-    noise = scipy.stats.t.ppf((1 + LEVEL) / 2, freedom) * math.sqrt(2 * variance / seeds) if freedom else math.nan
+    freedom, seeds = sum(len(v) - 1 for v in errors.values()), min(len(v) for v in errors.values())
+    if not freedom:
+        raise UserError(f"{results.directory}: has one seed, so no noise of seeds; compare with 2 seeds or more")
+    variance = sum(((v - v.mean()) ** 2).sum() for v in errors.values()) / freedom
+    noise = scipy.stats.t.ppf((1 + LEVEL) / 2, freedom) * math.sqrt(2 * variance / seeds)
     best = min(v.mean() for v in errors.values())
     rows = []
     for m, v in errors.items():
         sizes = (results.mean(m, "time_per_frame_s"), int(results.mean(m, "parameters")))
         behind = v.mean() - best
-        rows.append(Row(m, results.mean(m, key), *sizes, math.expm1(behind), not behind > noise))
+        rows.append(Row(m, results.mean(m, key), *sizes, math.expm1(behind), bool(behind <= noise)))
     return sorted(rows, key=lambda row: row.time), math.expm1(noise)
 
 
