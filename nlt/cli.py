@@ -59,9 +59,13 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.compare import compare
         from nlt.evaluation.comparison import Comparison
 
-        comparison = Comparison.load(options.config, options.scale, options.data, options.methods, options.seeds)
-        slurm = dict(options.slurm)
+        chosen = (options.scale, options.data, options.methods, options.seeds, options.precision)
+        comparison, slurm = Comparison.load(options.config, *chosen), dict(options.slurm)
         compare(comparison, options.out, options.workers, options.scheduler, slurm, options.train_images)
+    elif options.command == "export":
+        from nlt.evaluation.export import export
+
+        export(options.checkpoint, options.output, options.resolution, options.photons)
     elif options.command == "bench":
         _bench(options)
     elif options.command == "report":
@@ -148,7 +152,16 @@ def _parser() -> argparse.ArgumentParser:
         help="train every method on the first N images of each scene, too: for the learning curves",
     )  # fmt: skip
     _add_scheduler(compare, "trainings side by side (default: in turn; on a cluster as `nlt generate`)")
+    compare.add_argument(
+        "--precision", choices=("auto", "32", "bf16"), default="auto",
+        help="in which methods are trained, judged and timed (default: auto, bf16 where the device multiplies it)",
+    )  # fmt: skip
     _add_bench(commands.add_parser("bench", help="what a frame, a training step and a sample cost, stage by stage"))
+    export = commands.add_parser("export", help="a trained network as one file that runs with PyTorch alone")
+    export.add_argument("checkpoint", help="of nlt fit")
+    export.add_argument("-o", "--output", required=True, help="the torch.export program, such as nlt.pt2")
+    export.add_argument("--resolution", type=_positive, default=256, help="of its images (default: 256)")
+    export.add_argument("--photons", type=_positive, default=10000, help="that it is given (default: 10000)")
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
     board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")

@@ -203,13 +203,10 @@ def _with_place(message: str, given: dict[str, str], command: str) -> str:
     return f"{place}: {message}; see nlt {command} --help"
 
 
-PRECISIONS = ("32-true", "bf16-mixed")  # of the trainings, as the device has it
-
-
 def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:
     """What the trainer does unless a config says otherwise."""
     return {
-        "precision": PRECISIONS[Policy.for_device(default_device()).bfloat16],
+        "precision": Policy.for_device(default_device()).precision,
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
         "default_root_dir": "runs",
@@ -227,6 +224,22 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """A checkpoint, without running any code that it may hold. A file that is none raises anything."""
     checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     return dict(checkpoint)
+
+
+def load_method(path: str, place: str, device: torch.device | str = "cpu") -> RenderingModule:
+    """The method of a checkpoint; `place` is what asks for it, such as an option.
+
+    Raises:
+        UserError: it cannot be read, or is none.
+    """
+    try:
+        return RenderingModule.load_from_checkpoint(path, map_location=device)
+    except OSError as error:
+        raise UserError(f"{place}: {path}: cannot be read: {error.strerror}") from None
+    except UserError:
+        raise
+    except Exception:  # whatever a damaged file makes the unpickler raise
+        raise UserError(f"{place}: {path}: not a checkpoint, or damaged; give another one") from None
 
 
 def newest_checkpoint(run: Path) -> Path | None:

@@ -36,11 +36,14 @@ from nlt.evaluation.report import draw
 from nlt.evaluation.results import load, write_images, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.module import RenderingModule
+from nlt.models.policy import Policy
+from nlt.models.unet import UNet
 from nlt.paths import CONFIGS, PROJECT
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+CPU = torch.device("cpu")
 ACCURACY = ("mse", "unbiased_mse", "reference_noise", "mssim", "fid", "feature_l1")
 STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
 UNTRAINED = ("path_tracing_1", "path_tracing_4", "path_tracing_16", "oidn_1", "oidn_4")
@@ -201,6 +204,8 @@ def test_time_is_the_sum_of_the_stages_medians(world):
         for stage, seconds in medians.items():
             assert float(row[f"{stage}_s"]) == pytest.approx(seconds)
         assert float(row["time_per_frame_s"]) == pytest.approx(sum(medians.values()))
+        of_camera = [seconds for stage, seconds in medians.items() if stage not in ("photons", "transport")]
+        assert float(row["moving_camera_s"]) == pytest.approx(sum(of_camera))
     assert "photons" in RenderingModule.load_from_checkpoint(world.checkpoint("extra")).stages
 
 
@@ -210,7 +215,7 @@ def test_metrics_are_those_of_the_predictions(world):
     mse, mssim = [], []
     for k in range(3):
         batch = default_collate([dataset[k]])
-        with torch.no_grad():
+        with torch.no_grad(), Policy.for_device(CPU).applied(CPU):
             prediction = module(batch)
         pair = [shown(x, batch) for x in (prediction, (batch["reference_a"] + batch["reference_b"]) / 2)]
         mse.append(np.mean((pair[0] - pair[1]) ** 2))
@@ -292,10 +297,9 @@ def test_nothing_is_trained_twice(world, trainings):
 def test_a_second_device_adds_its_times(world, trainings, monkeypatch):
     """Nothing is trained for it; the first one's times stay."""
     shutil.copytree(world.folder / "out", world.folder / "devices", ignore=shutil.ignore_patterns("*.png", "*.svg"))
-    here, defaults = compare.surroundings, training.trainer_defaults()
-    (other,) = {*training.PRECISIONS} - {defaults["precision"]}
-    monkeypatch.setattr("nlt.evaluation.trainings.trainer_defaults", lambda: defaults | {"precision": other})
-    monkeypatch.setattr(compare, "surroundings", lambda device: here(device) | {"device": "GPU, made up"})
+    here, other = compare.surroundings, not Policy.for_device(CPU).bfloat16
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": other})
+    monkeypatch.setattr(compare, "surroundings", lambda *given: here(*given) | {"device": "GPU, made up"})
     second = world.compare("--methods", "cnn", "path_tracing_1", out="devices")
     assert trainings == []
     results = load(world.folder / "devices")
@@ -322,6 +326,30 @@ def test_one_methods_config_retrains_this_method(world, trainings):
         file.write_text(before)
     rows = world.compare("--methods", "feature_projection")
     assert len(trainings) == 1 and rows["feature_projection"]["mse"] == world.rows["feature_projection"]["mse"]
+
+
+def test_precision(world, trainings, monkeypatch):
+    """What the device has, unless switched off: of the training, of the images that are judged, in the manifest."""
+    first = Policy.for_device(CPU).bfloat16
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    seen = []
+
+    def convolution(self, features):
+        seen.append(torch.is_autocast_enabled("cpu"))
+        return forward(self, features)
+
+    forward = UNet.forward
+    monkeypatch.setattr(UNet, "forward", convolution)
+    for options, bfloat16 in (((), True), (("--precision", "32"), False)):
+        del seen[:]
+        world.compare("--methods", "cnn", *options, out=f"precision{bfloat16}")
+        assert set(seen) == {bfloat16} and len(seen) > 4
+        manifest = json.loads((world.folder / f"precision{bfloat16}/manifest.json").read_text())
+        assert manifest["policy"] == {"bfloat16": bfloat16}
+    assert "precision: 32-true" in (world.run("cnn") / "config.yaml").read_text()
+    assert len(trainings) == first  # if the first comparison's is not in float32
+    if trainings:
+        shutil.rmtree(world.run("cnn"))  # others look for the newest
 
 
 def test_a_killed_training_goes_on(world, more_methods):
@@ -587,13 +615,13 @@ def test_sizes(world):
 
     frames = Frames(LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test"))
     module = OneConvolution(width=5)
-    size = clock.Clock(frames, torch.device("cpu")).size(module)
+    size = clock.Clock(frames, torch.device("cpu"), policy=Policy()).size(module)
     assert size["parameters"] == sum(p.numel() for p in module.parameters())
     pixels, channels = 16 * 16, 10
     assert size["flops"] == 2 * 9 * channels * 5 * pixels
-    # The features' concatenation and the convolution's output; inputs and parameters besides.
+    # The maps in the convolution's layout and their concatenation; inputs and parameters besides.
     inputs = 4 * (pixels * channels + 1) + 2 * 8
-    assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + 5)
+    assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + channels)
     assert set(clock.Clock(frames, torch.device("cpu")).size(comparison.untrained("oidn_1"))) == {"parameters"}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import lightning as L
@@ -9,17 +11,19 @@ import pytest
 import torch
 from jsonargparse import ArgumentParser
 from lightning.pytorch.loggers import TensorBoardLogger
-from synthetic import POINTS, SCENES, synthetic_batch
+from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
 from torch.utils.data import DataLoader
 
 from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
+from nlt.cli import main
 from nlt.errors import UserError
 from nlt.evaluation.comparison import untrained
 from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
+from nlt.models.moving_camera import MovingCamera
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.plain import plain
 from nlt.paths import config_names, find_config
@@ -335,6 +339,53 @@ def test_resuming_is_exact(tmp_path, config):
     trainer(tmp_path, max_epochs=2).fit(resumed, data, ckpt_path=tmp_path / "first.ckpt", weights_only=True)
     for a, b in zip(through.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+# --- inference ---
+
+
+def test_a_moving_camera_reuses_the_state(method):
+    """The same image to the bit, light transport computed once for a state, anew for another one."""
+    moving, (here, there) = MovingCamera(method), (synthetic_batch(seed=seed) for seed in (0, 1))
+    there |= {name: here[name] for name in method.state_inputs}
+    calls, transport = [], method.transport
+    method.transport = lambda state: calls.append(state) or transport(state)
+    with torch.no_grad():
+        for batch in (here, there, here):
+            assert torch.equal(moving(batch), method.synthesize(batch, method.features(batch, transport(batch))))
+        assert len(calls) == 1
+        here["exposure"] *= 2  # in place
+        expected = method.synthesize(here, method.features(here, transport(here)))
+        assert torch.equal(moving(here), expected) and len(calls) == 2
+
+
+_ALONE = """
+import sys, torch
+for name in ("nlt", "lightning", "mitsuba"):
+    sys.modules[name] = None  # importing it fails
+for folder in sys.argv[1:]:
+    batch, expected = torch.load(f"{folder}/frame.pt")
+    torch.testing.assert_close(torch.export.load(f"{folder}/program.pt2").module()(batch), expected)
+    print(folder)
+"""
+
+
+def test_exported_programs_run_alone(tmp_path, checkpoints):
+    """Every method's, with PyTorch and nothing else: the same image."""
+    folders = []
+    for name, path in checkpoints.items():
+        folders.append(tmp_path / name)
+        folders[-1].mkdir()
+        program = folders[-1] / "program.pt2"
+        assert main(["export", str(path), "-o", str(program), "--resolution=16", f"--photons={PHOTONS}"]) == 0
+        method, whole = RenderingModule.load_from_checkpoint(path).eval(), synthetic_batch(1)
+        batch = {field: whole[field] for field in (*method.inputs, "exposure", "scene", "index")}
+        with torch.no_grad():
+            torch.save((batch, method(batch)), folders[-1] / "frame.pt")
+    done = subprocess.run(
+        [sys.executable, "-c", _ALONE, *map(str, folders)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [str(folder) for folder in folders]
 
 
 # --- without training ---

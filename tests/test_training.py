@@ -16,7 +16,6 @@ from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import write_shard
-from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.training import run_lightning
@@ -106,7 +105,7 @@ def test_sample_that_is_not_finite(tiny, tmp_path, capfd):
 
 
 def test_mixed_precision(tiny, tmp_path, monkeypatch):
-    """Where the device has bfloat16, layers use it; the weights and Adam's state do not, nor do the metrics."""
+    """Where the device has bfloat16, layers use it; the weights and Adam's state do not."""
     seen = {}
 
     def step(self, batch, index):
@@ -114,17 +113,12 @@ def test_mixed_precision(tiny, tmp_path, monkeypatch):
         seen["training"] = torch.is_autocast_enabled("cpu"), self(batch).dtype, loss.dtype
         return loss
 
-    def update(self, *images, **more):
-        seen["metrics"] = torch.is_autocast_enabled("cpu")
-        return metrics_update(self, *images, **more)
-
-    training_step, metrics_update = CNN.training_step, ImageMetrics.update
+    training_step = CNN.training_step
     monkeypatch.setattr(CNN, "training_step", step)
-    monkeypatch.setattr(ImageMetrics, "update", update)
     for has in (True, False):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {"avx512_bf16": has, "avx512_f": True})
         trainer = run_lightning(tiny.command("fit", "cnn", f"--trainer.default_root_dir={tmp_path}")).trainer
-        assert seen == {"training": (has, torch.float32, torch.float32), "metrics": False}
+        assert seen == {"training": (has, torch.float32, torch.float32)}
         checkpoint = torch.load(trainer.checkpoint_callback.best_model_path, weights_only=True)
         state = checkpoint["optimizer_states"][0]["state"].values()
         tensors = [*checkpoint["state_dict"].values(), *(moments["exp_avg"] for moments in state)]

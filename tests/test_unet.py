@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 
-from nlt.models.unet import UNet
+from nlt.models.unet import ConvBlock, UNet, UpBlock
 
 
 @pytest.mark.parametrize("size", [(16, 16), (13, 22), (1, 5), (8, 3)])
@@ -11,6 +12,14 @@ from nlt.models.unet import UNet
 def test_shape(size, depth):
     net = UNet(5, width=4, depth=depth, out_channels=2)
     assert net(torch.randn(2, 5, *size)).shape == (2, 2, *size)
+
+
+def test_up_block_equals_the_block_on_what_is_joined():
+    torch.manual_seed(0)
+    block = UpBlock(7, 4).double()
+    x, skip = torch.randn(2, 5, 3, 4, dtype=torch.float64), torch.randn(2, 2, 6, 7, dtype=torch.float64)
+    joined = torch.cat([F.interpolate(x, size=(6, 7), mode="bilinear", align_corners=False), skip], dim=1)
+    torch.testing.assert_close(block(x, skip), ConvBlock.forward(block, joined))
 
 
 def test_number_of_parameters():

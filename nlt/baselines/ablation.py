@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nlt.errors import UserError
-from nlt.models.module import PROJECTION, Batch, RenderingModule
+from nlt.models.module import PROJECTION, Batch, RenderingModule, join
 from nlt.models.transport import PointEmbedding
 
 INPUTS = ("position", "point_features", "normal", "ray_direction")
@@ -70,4 +70,4 @@ class InputAblation(RenderingModule):
             maps.append(batch["normal"])
         if self.hparams["ray_direction"]:
             maps.append(batch["view_direction"])
-        return torch.cat(maps, dim=1)
+        return join(maps)

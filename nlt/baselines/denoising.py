@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, join, log_exposed
 
 
 def _hash(x: Tensor) -> Tensor:
@@ -74,4 +74,4 @@ class SparseDenoising(RenderingModule):
         maps = [radiance, mask.to(radiance.dtype)]
         if self.hparams["gbuffer"]:
             maps.append(self.gbuffer(batch))
-        return torch.cat(maps, dim=1)
+        return join(maps)

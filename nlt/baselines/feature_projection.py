@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join
 from nlt.models.transport import PointEmbedding
 
 
@@ -35,4 +34,4 @@ class FeatureProjection(RenderingModule):
     def features(self, batch: Batch, transported: Any = None) -> Tensor:
         features = self.embedding(batch["scene"])
         projected = self.project(batch, features, batch["point_position"], batch["point_visible"])
-        return torch.cat([self.gbuffer(batch), projected], dim=1)
+        return join([self.gbuffer(batch), projected])

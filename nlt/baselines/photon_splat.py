@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join, log_exposed
 from nlt.models.projection import total, visible_pixels
 
 _GRAZING = 0.01  # the least cosine: at a grazing angle a pixel sees less than its plane's area to the horizon
@@ -74,4 +74,4 @@ class PhotonSplat(RenderingModule):
 
     def features(self, batch: Batch, transported: Any = None) -> Tensor:
         estimates = [log_exposed(irradiance, batch["exposure"]) for irradiance in self.irradiance(batch)]
-        return torch.cat([self.gbuffer(batch), *estimates], dim=1)
+        return join([self.gbuffer(batch), *estimates])

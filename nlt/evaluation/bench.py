@@ -45,7 +45,7 @@ from nlt.models.plain import plain
 from nlt.models.policy import default_device
 from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
-from nlt.training import quiet, trainer_defaults
+from nlt.training import load_method, quiet, trainer_defaults
 
 # What may be set: of the dataset, the model, the training, and how many frames are made at once.
 _DATASET, _MODEL, _DATA = ("resolution", "points", "photons"), ("width", "depth"), ("batch_size", "workers")
@@ -274,14 +274,7 @@ class _Bench:
             raise UserError(f"{file}: model: {error}") from None
 
     def _loaded(self, name: str) -> RenderingModule:
-        try:
-            method = RenderingModule.load_from_checkpoint(str(self.checkpoint), map_location=self.device)
-        except OSError as error:
-            raise UserError(f"--ckpt: {self.checkpoint}: cannot be read: {error.strerror}") from None
-        except UserError:
-            raise
-        except Exception:  # whatever a damaged file makes the unpickler raise
-            raise UserError(f"--ckpt: {self.checkpoint}: not a checkpoint, or damaged; give another one") from None
+        method = load_method(str(self.checkpoint), "--ckpt", self.device)
         wanted = read_configs([str(find_config("model", name))])["model"]["class_path"]
         if method.class_path() != wanted:
             raise UserError(f"--ckpt: {self.checkpoint}: is of {method.class_path()}, not {wanted}; give its --methods")

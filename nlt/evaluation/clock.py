@@ -19,8 +19,10 @@ from torch.utils.data import default_collate
 from torch.utils.flop_counter import FlopCounterMode
 
 from nlt.evaluation.frames import Frames
+from nlt.metrics.quantities import STATE_STAGES
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
+from nlt.models.policy import Policy
 
 WARM_UP, FRAMES, LEAST_FRAMES = 10, 40, 3
 _WARM_UP_SHARE = 0.2  # of a limited time
@@ -33,17 +35,17 @@ class Clock:
     pixels that the method is fed with, light transport, projection and synthesis or denoising. Not charged,
     being the same for all methods: moving the scene's objects.
 
-    `batch`: how many frames are made at once.
+    `batch`: how many frames are made at once. `policy`: how they are computed; None for the device's own.
     """
 
-    def __init__(self, frames: Frames, device: torch.device, batch: int = 1) -> None:
+    def __init__(self, frames: Frames, device: torch.device, batch: int = 1, policy: Policy | None = None) -> None:
         self.frames, self.dataset, self.device, self.batch = frames, frames.dataset, device, batch
+        self.policy = policy or Policy.for_device(device)
 
     def time(self, method: Method) -> dict[str, Any]:
         """Seconds by stage and of the frame, as `summary` says; warm-up 10 frames, then 40 timed ones."""
         return summary(self.race({"": method})[""])
 
-    @torch.inference_mode()
     def race(self, methods: Mapping[str, Method], seconds: float = math.inf) -> dict[str, list[dict[str, float]]]:
         """Seconds by stage of every timed frame, by method; the device is synchronised around every stage.
 
@@ -54,16 +56,17 @@ class Clock:
         rows = np.linspace(0, len(self.dataset) - 1, min(len(self.dataset), WARM_UP + FRAMES)).astype(int)
         timed: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
         begin, number = time.perf_counter(), 0
-        for most, least, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
-            for laps in timed.values():
-                laps.clear()
-            for k in range(most):
-                if k >= least and time.perf_counter() - begin > share * seconds:
-                    break
-                indices = [int(rows[(number + j) % len(rows)]) for j in range(self.batch)]
-                number += self.batch
-                for name, method in methods.items():
-                    timed[name].append(self._frame(method, indices))
+        with torch.inference_mode(), self.policy.applied(self.device):
+            for most, least, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
+                for laps in timed.values():
+                    laps.clear()
+                for k in range(most):
+                    if k >= least and time.perf_counter() - begin > share * seconds:
+                        break
+                    indices = [int(rows[(number + j) % len(rows)]) for j in range(self.batch)]
+                    number += self.batch
+                    for name, method in methods.items():
+                        timed[name].append(self._frame(method, indices))
         return timed
 
     def _frame(self, method: Method, indices: Sequence[int]) -> dict[str, float]:
@@ -122,7 +125,7 @@ class Clock:
         if cuda:
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        with torch.no_grad(), memory:
+        with torch.no_grad(), self.policy.applied(self.device), memory:
             method(batch)
         peak = torch.cuda.max_memory_allocated(self.device) - before if cuda else memory.peak
         held = sum(t.numel() * t.element_size() for t in [*parameters, *batch.values()])
@@ -133,7 +136,7 @@ class Clock:
         """Floating-point operations of a batch's convolutions and matrix products, by step."""
         batch, result, flops = self._inputs(method), None, {}
         for name, step in method.to(self.device).eval().steps().items():
-            with FlopCounterMode(display=False) as counter:
+            with self.policy.applied(self.device), FlopCounterMode(display=False) as counter:
                 result = step(batch, result)
             flops[name] = counter.get_total_flops()
         return flops
@@ -148,11 +151,13 @@ class Clock:
 def summary(laps: list[dict[str, float]]) -> dict[str, Any]:
     """Of timed frames, in seconds: median and p95 by stage; `time_per_frame_s` is the sum of the stages' medians.
 
-    `time_per_frame_error_s` is its standard error, bootstrapped over the frames.
+    `moving_camera_s` leaves out what does not depend on the camera. `time_per_frame_error_s` is the standard error of
+    `time_per_frame_s`, bootstrapped over the frames.
     """
     stages = {name: np.array([frame[name] for frame in laps]) for name in laps[0]}
     result = {f"{name}_s": float(np.median(seconds)) for name, seconds in stages.items()}
-    result["time_per_frame_s"] = sum(result.values())
+    moving = sum(value for name, value in result.items() if name.removesuffix("_s") not in STATE_STAGES)
+    result |= {"time_per_frame_s": sum(result.values()), "moving_camera_s": moving}
     total = lambda *seconds, axis: sum(np.median(s, axis=axis) for s in seconds)
     spread = scipy.stats.bootstrap(
         tuple(stages.values()), total, paired=True, n_resamples=200, method="basic", rng=np.random.default_rng(0)

@@ -39,7 +39,7 @@ from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.evaluation.trainings import Training, check, train
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
-from nlt.models.policy import default_device
+from nlt.models.policy import Policy, default_device
 
 _ROW = ("method", "seed", "train_images", "status", "message")  # of training_images.csv, before its metrics
 
@@ -80,12 +80,13 @@ def compare(
     if history := _history(trainings.values()):
         write_rows(directory / HISTORY, history)
     device = default_device()
+    policy = Policy.for_device(device, comparison.precision)
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
-    test, clock = Evaluation(frames, device), Clock(frames, device)
+    test, clock = Evaluation(frames, device, policy), Clock(frames, device, policy=policy)
     test.write_references(directory)
     record = {
         **begun,
-        **surroundings(device),
+        **surroundings(device, policy),
         "comparison": comparison.name,
         "table": comparison.table,
         "methods": comparison.methods,

@@ -29,10 +29,17 @@ class Comparison:
     table: str | None = None
     methods: list[str] = field(default_factory=list)
     seeds: list[int] = field(default_factory=lambda: [0])
+    precision: str = "auto"
 
     @classmethod
     def load(
-        cls, config: str, scale: str | None, data: str | None, methods: list[str] | None, seeds: int = 1
+        cls,
+        config: str,
+        scale: str | None,
+        data: str | None,
+        methods: list[str] | None,
+        seeds: int = 1,
+        precision: str = "auto",
     ) -> Comparison:
         """Read a config by name or path; the other arguments override it.
 
@@ -73,6 +80,7 @@ class Comparison:
             table=table,
             methods=sorted(wanted, key=order),
             seeds=list(range(seed, seed + seeds)),
+            precision=precision,
         )
 
     def jobs(self) -> list[tuple[str, int]]:

@@ -18,6 +18,7 @@ from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.jackknife import fid_and_kid_without
 from nlt.models.method import Batch, Method
 from nlt.models.module import PROJECTION
+from nlt.models.policy import Policy
 from nlt.models.projection import visible_pixels
 
 _SHOWN = 32  # test views whose images are kept
@@ -28,8 +29,8 @@ _MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept: 
 class Evaluation:
     """The test split, judged by one set of metrics; reference features are computed once for all methods."""
 
-    def __init__(self, frames: Frames, device: torch.device) -> None:
-        self.frames, self.device = frames, device
+    def __init__(self, frames: Frames, device: torch.device, policy: Policy) -> None:
+        self.frames, self.device, self.policy = frames, device, policy
         self.directory, self.spec = frames.dataset.directory, frames.dataset.spec
         self._features: dict[int, dict[str, Tensor] | None] = {}
         self.shown = list(range(0, len(self), max(1, len(self) // _SHOWN)))[:_SHOWN]
@@ -77,7 +78,8 @@ class Evaluation:
             if "traced" in method.inputs and method.spp:
                 cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            prediction = method(batch)
+            with self.policy.applied(self.device):  # the images that are timed
+                prediction = method(batch)
             if not prediction.isfinite().all():
                 raise DivergedError(f"a prediction is not finite, among test samples {indices}")
             reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import torch
 
 from nlt.evaluation.clock import FRAMES, WARM_UP
 from nlt.metrics.inception import find_weights
+from nlt.models.policy import Policy
 from nlt.paths import PROJECT
 from nlt.rendering.variant import choose_variant
 
@@ -35,7 +37,7 @@ def origin() -> dict[str, Any]:
     }
 
 
-def surroundings(device: torch.device) -> dict[str, Any]:
+def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str, Any]:
     """What else decides a result: device, versions, how it was timed."""
     variant, weights = choose_variant(), find_weights()
     return {
@@ -46,7 +48,8 @@ def surroundings(device: torch.device) -> dict[str, Any]:
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "mitsuba_variant": f"{variant.name}: {variant.reason}",
         "inception_weights": Path(weights).name if weights else None,
-        "clock": {"batch": 1, "warm_up_frames": WARM_UP, "timed_frames": FRAMES, "precision": "float32"},
+        "clock": {"batch": 1, "warm_up_frames": WARM_UP, "timed_frames": FRAMES},
+        "policy": asdict(policy or Policy.for_device(device)),
     }
 
 

@@ -65,7 +65,8 @@ def tables(results: Results) -> list[Table]:
     teachers = [f"{teacher} in {s}" for s, teacher in results.manifest.get("teachers", {}).items() if teacher != "path"]
     if teachers:
         note += f" Path tracing rows, OIDN's and denoising's input: traced by {', '.join(teachers)}."
-    stages = tuple(f"{stage}_s" for stage in STAGES if any(_measured(results, f"{stage}_s")))
+    times = (*(f"{stage}_s" for stage in STAGES), "moving_camera_s")
+    stages = tuple(key for key in times if any(_measured(results, key)))
     bounds = [key for key in ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1") if _measured(results, key)]
     interval = lambda _, method, key: " to ".join(text(key, bound) for bound in results.interval(method, key))
     here = lambda keys: [(key, results) for key in keys]

@@ -23,7 +23,8 @@ from nlt.evaluation.comparison import Comparison, untrained
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
 from nlt.evaluation.provenance import origin
 from nlt.models.module import RenderingModule
-from nlt.training import PRECISIONS, check_configs, newest_checkpoint, run_lightning, trainer_defaults
+from nlt.models.policy import Policy, default_device
+from nlt.training import check_configs, newest_checkpoint, run_lightning
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Training:
         if train_images:
             merged = merge(merged, {"data": {"train_images": train_images}})
         # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
-        precisions = dict.fromkeys((trainer_defaults()["precision"], *PRECISIONS))
+        wanted = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
+        precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in wanted)
         runs = {precision: root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions}
         precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
         # Absolute: processes elsewhere have other working directories.

@@ -8,6 +8,7 @@ from typing import Literal
 # The stages of a frame: rendered, then computed. A method pays for those it needs.
 RENDERED_STAGES = ("gbuffer", "photons", "path_tracing")
 NETWORK_STAGES = ("transport", "projection", "synthesis")
+STATE_STAGES = ("photons", "transport")  # do not depend on the camera
 STAGES = (*RENDERED_STAGES, *NETWORK_STAGES, "denoise")
 INCEPTION_STAGES = ("layer0", "layer1", "layer2", "layer3")
 
@@ -57,6 +58,7 @@ COSTS: dict[str, Quantity] = {
     "time_per_frame_s": Quantity("time / frame", "lower", ".4f", "s"),
     **{f"{stage}_s": Quantity(stage.replace("_", " "), "lower", ".2f", "ms", 1e3) for stage in STAGES},
     "time_per_frame_p95_s": Quantity("p95 of a frame", "lower", ".2f", "ms", 1e3),
+    "moving_camera_s": Quantity("time / frame, moving camera", "lower", ".2f", "ms", 1e3),
     "parameters": Quantity("parameters", "lower", ",.0f"),
     "flops": Quantity("FLOPs / frame", "lower", ".2f", "G", 1e-9),
     "peak_memory_bytes": Quantity("peak memory", "lower", ".1f", "MiB", 2**-20),

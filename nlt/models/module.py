@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +37,13 @@ def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
     the rest, and fed linearly would swamp every feature it is mixed with.
     """
     return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
+
+
+def join(maps: Sequence[Tensor]) -> Tensor:
+    """Maps (B, C, H, W) to one of all their channels, in the layout and precision that the convolutions read."""
+    device = maps[0].device.type
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps[0].dtype
+    return torch.cat([x.to(dtype, memory_format=torch.channels_last) for x in maps], dim=1)
 
 
 class RenderingModule(Method, L.LightningModule):
@@ -104,8 +111,13 @@ class RenderingModule(Method, L.LightningModule):
         """Channels of what `features` returns."""
         raise NotImplementedError
 
+    @property
+    def state_inputs(self) -> tuple[str, ...]:
+        """The batch fields that do not depend on the camera: all that `transport` may read."""
+        return (*(name for name in self.inputs if name.startswith(("point_", "photon_"))), "scene", "exposure")
+
     def transport(self, batch: Batch) -> Any:
-        """Light transport: whatever `features` takes up again; None for a method without."""
+        """Light transport, of the `state_inputs`: whatever `features` takes up again; None for a method without."""
         return None
 
     def features(self, batch: Batch, transported: Any = None) -> Tensor:
@@ -116,7 +128,7 @@ class RenderingModule(Method, L.LightningModule):
 
     def gbuffer(self, batch: Batch) -> Tensor:
         """(B, 10, H, W): depth, normal, albedo and view direction."""
-        return torch.cat([batch[name] for name in GBUFFER], dim=1)
+        return join([batch[name] for name in GBUFFER])
 
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
         """Eq. (1) with the batch's camera: features (B, N, C) at positions (B, N, 3) to (B, C, H, W)."""
@@ -171,8 +183,7 @@ class RenderingModule(Method, L.LightningModule):
 
     def _evaluation_step(self, batch: Batch) -> Tensor:
         prediction = self(batch)
-        with torch.autocast(prediction.device.type, enabled=False):  # which is for methods, not their judge
-            self._metrics[0].update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"])
+        self._metrics[0].update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"])
         return prediction
 
     def _log_metrics(self, prefix: str) -> None:

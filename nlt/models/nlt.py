@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.data.sample import MATERIALS
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join, log_exposed
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
 POINT_ATTRIBUTES = 3 + len(MATERIALS) + 3 + 3 + 1  # position, material, albedo, emission, visibility
@@ -86,4 +86,4 @@ class NeuralLightTransport(RenderingModule):
             maps.append(self.project(batch, points, batch["point_position"], batch["point_visible"]))
         if photons is not None:  # a map of their own: a mean over both would mix two kinds of feature
             maps.append(self.project(batch, photons, batch["photon_hit"], batch["photon_valid"]))
-        return torch.cat(maps, dim=1)
+        return join(maps)

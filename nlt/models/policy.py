@@ -1,7 +1,8 @@
-"""Which fast paths a device gets: decided here alone, recorded in results, each to be switched off."""
+"""Which fast paths a device gets: decided here alone, recorded in results, to be switched off by `--precision 32`."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -21,15 +22,27 @@ def fast_bfloat16(device: torch.device) -> bool:
 
 @dataclass(frozen=True)
 class Policy:
-    """How methods are computed. Without arguments: float32, as written.
+    """How methods are trained, timed and judged. Without arguments: float32.
 
     `bfloat16`: convolutions and linear layers by autocast. Its exponent is float32's, so no loss is scaled; weights,
     Adam's state, positions, projection, loss and metrics stay float32.
+
+    The convolutions' layout is channels_last either way, and `nlt.models.plain` the path without any of it. Neither
+    torch.compile nor CUDA graphs: they were not tried on a GPU, and a CPU need not have a compiler.
     """
 
     bfloat16: bool = False
 
     @classmethod
-    def for_device(cls, device: torch.device) -> Policy:
-        """All that the device has."""
-        return cls(bfloat16=fast_bfloat16(device))
+    def for_device(cls, device: torch.device, precision: str = "auto") -> Policy:
+        """`precision`: auto for what the device has, 32, or bf16."""
+        return cls(bfloat16=precision == "bf16" or (precision == "auto" and fast_bfloat16(device)))
+
+    @property
+    def precision(self) -> str:
+        """As Lightning's trainer calls it."""
+        return "bf16-mixed" if self.bfloat16 else "32-true"
+
+    def applied(self, device: torch.device) -> AbstractContextManager[None]:
+        """What is computed within goes by the policy; stay in it for many frames, for it keeps the weights it cast."""
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16)

@@ -82,7 +82,7 @@ def total(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
 def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
     """Mean of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W), 0 where none."""
     count = total(torch.ones_like(features[..., :1], dtype=torch.float32), pixels, height, width)
-    return total(features, pixels, height, width) / count.clamp(min=1)
+    return total(features, pixels, height, width).div_(count.clamp(min=1))
 
 
 def project(

@@ -19,7 +19,20 @@ class ConvBlock(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.shortcut(x) + self.conv_1(F.relu(self.conv_0(F.relu(x))))
+        return self._add_residual(self.shortcut(x), F.relu(x))
+
+    def _add_residual(self, shortcut: Tensor, activated: Tensor) -> Tensor:
+        return shortcut + self.conv_1(F.relu(self.conv_0(activated), inplace=True))
+
+
+class UpBlock(ConvBlock):
+    """The block on the upsampled x and, behind it, skip: (B, C, h, w), (B, in - C, H, W) -> (B, out, H, W)."""
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
+        up = lambda y: F.interpolate(y, size=skip.shape[-2:], mode="bilinear", align_corners=False)
+        of_x, of_skip = self.shortcut.get_parameter("weight").split([x.shape[1], skip.shape[1]], dim=1)
+        shortcut = up(F.conv2d(x, of_x)) + F.conv2d(skip, of_skip)  # a 1x1 convolution is cheaper before upsampling
+        return self._add_residual(shortcut, F.relu(torch.cat([up(x), skip], dim=1), inplace=True))
 
 
 class UNet(nn.Module):
@@ -34,7 +47,7 @@ class UNet(nn.Module):
         widths = [width * 2**level for level in range(depth + 1)]
         self.conv_in = nn.Conv2d(in_channels, width, 3, padding=1)
         self.down = nn.ModuleList(ConvBlock(widths[max(i - 1, 0)], widths[i]) for i in range(depth + 1))
-        self.up = nn.ModuleList(ConvBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth)))
+        self.up = nn.ModuleList(UpBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth)))
         self.conv_out = nn.Conv2d(width, out_channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -44,6 +57,5 @@ class UNet(nn.Module):
             skips.append(x)
             x = block(F.max_pool2d(x, 2, ceil_mode=True))  # ceil: a side of 1 stays 1
         for block, skip in zip(self.up, reversed(skips), strict=True):
-            x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=False)
-            x = block(torch.cat([x, skip], dim=1))
+            x = block(x, skip)
         return self.conv_out(F.relu(x))
