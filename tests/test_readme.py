@@ -15,4 +15,4 @@ def test_tables_are_the_results():
 def test_provenance():
     record = json.loads((PROJECT / "results/table2/manifest.json").read_text())
     assert record["command"].startswith("nlt compare") and len(record["commit"]) == 40
-    assert record["n_test"] == 64 and record["seed"] == 0 and record["device"] and record["versions"]["torch"]
+    assert record["n_test"] == 64 and record["seeds"] == [0] and record["device"] and record["versions"]["torch"]
