@@ -81,7 +81,7 @@ def test_photon_splat(tmp_path):
             "view_direction": camera.view_directions()}  # fmt: skip
     batch = default_collate([{**view, **renderer.photons(4000, seed)} for seed in range(40)])
     batch = {name: value.float() if value.is_floating_point() else value for name, value in batch.items()}
-    (ours,) = PhotonSplat(width=1).irradiance(batch)
+    ours = PhotonSplat(width=1, footprint=0).irradiance(batch)
     plain, albedo = mi.load_file(str(tmp_path / "scene.xml"), optimize=False), np.array([0.7, 0.6, 0.5])
 
     def mitsubas(depth):

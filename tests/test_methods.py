@@ -128,7 +128,7 @@ def test_doubled_exposure_of_halved_light(method):
     torch.testing.assert_close(method(batch), expected)
 
 
-@pytest.mark.parametrize("name", ["nlt_photons", "photon_splat", "leaner/photons"])
+@pytest.mark.parametrize("name", ["nlt_photons", "leaner/photons"])
 def test_splitting_the_photons(name):
     """Each photon as two of half the flux: the same light, the same prediction."""
     batch, method = synthetic_batch(), build(find_config("model", name)).eval()

@@ -50,8 +50,8 @@ def footprints(batch):
     return np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]) / 2
 
 
-def method(**options):
-    return PhotonSplat(width=2, depth=1, **options)
+def irradiance(batch, footprint=0):
+    return PhotonSplat(width=2, depth=1, footprint=footprint).irradiance(batch)
 
 
 def test_area_that_a_pixel_sees():
@@ -61,45 +61,55 @@ def test_area_that_a_pixel_sees():
     np.testing.assert_allclose(seen_area(batch)[0, 0].numpy(), expected, rtol=0.01)
 
 
-@pytest.mark.parametrize("options", [{}, {"scales": 3}])
-def test_unbiased_on_a_plane(options):
+def test_unbiased_on_a_plane():
     """Over independent sets of photons, its mean is the plane's irradiance, near and far."""
     near = np.arange(SIZE) > SIZE / 2
-    for estimate in method(**options).irradiance(plane_batch(1000, 60)):
-        for rows in (near, ~near):
-            means = estimate[:, :, rows].mean((2, 3)).numpy()
-            assert stats.ttest_1samp(means[:, 0], 1.0).pvalue > 1e-3
-            np.testing.assert_allclose(means, means[:, :1] * [1.0, 2, 3], rtol=1e-9)
+    estimate = irradiance(plane_batch(1000, 60))
+    for rows in (near, ~near):
+        means = estimate[:, :, rows].mean((2, 3)).numpy()
+        assert stats.ttest_1samp(means[:, 0], 1.0).pvalue > 1e-3
+        np.testing.assert_allclose(means, means[:, :1] * [1.0, 2, 3], rtol=1e-9)
 
 
-def test_equals_the_loop_over_photons():
-    """The flux of each pixel's photons over its area, whatever flux they carry."""
+def test_a_footprint_trades_noise_for_bias():
+    batch = plane_batch(4000, 20)
+    pixel, wider = irradiance(batch)[:, 0], irradiance(batch, 4)[:, 0]
+    assert (wider > 0).all() and (pixel == 0).double().mean() > 0.05
+    assert wider.std() < pixel.std() / 2
+    assert 0 < wider.mean() - 1 < 0.2
+
+
+@pytest.mark.parametrize("footprint", [0, 1, 4, 1000])
+def test_equals_the_loop_over_photons(footprint):
+    """The flux of the photons in a pixel's footprint, whatever they carry, over its area."""
     batch = plane_batch(500)
     batch["photon_flux"] = torch.rand(1, 500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     batch["photon_valid"] = batch["photon_flux"][..., 0] < 0.7
-    expected = np.zeros((3, SIZE, SIZE))
+    batch["depth"][..., 5, 7] = 0  # no hit
+    area = footprints(batch)
+    area[5, 7] = 0
+    flux_in, count_in = np.zeros((3, SIZE, SIZE)), np.zeros((SIZE, SIZE))
     matrix, rotation = batch["camera_matrix"][0].numpy(), batch["world_to_view"][0, :3, :3].numpy()
     names = ("photon_hit", "photon_flux", "photon_valid")
     for hit, flux, valid in zip(*(batch[name][0].numpy() for name in names), strict=True):
         x, y, w = matrix @ rotation @ hit
-        if valid and w > 0 and 0 <= x / w < SIZE and 0 <= y / w < SIZE:
-            expected[:, int(y / w), int(x / w)] += flux
-    assert (expected > 0).any(0).sum() > 30
-    expected /= footprints(batch)
-    (density,) = method().irradiance(batch)
-    np.testing.assert_allclose(density[0].numpy(), expected, rtol=0.01)
+        if valid and w > 0 and 0 <= x / w < SIZE and 0 <= y / w < SIZE and area[int(y / w), int(x / w)]:
+            flux_in[:, int(y / w), int(x / w)] += flux
+            count_in[int(y / w), int(x / w)] += 1
+    assert (count_in > 0).sum() > 30
+    expected = np.zeros((3, SIZE, SIZE))
+    for row, column in np.argwhere(area > 0):
+        for radius in (0, 1, 2, 4, 8):
+            box = np.s_[..., max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+            if count_in[box].sum() >= footprint:
+                break
+        expected[:, row, column] = flux_in[box].sum((1, 2)) / area[box].sum()
+    np.testing.assert_allclose(irradiance(batch, footprint)[0].numpy(), expected, rtol=0.01)
 
 
-def test_no_photons_are_zeros():
+def test_no_photons_and_no_surface_are_zeros():
     batch = synthetic_batch()
-    batch["photon_valid"][:] = False
-    for scales in (1, 3):
-        features = method(scales=scales).features(batch)
-        assert features.isfinite().all() and (features[:, 10:] == 0).all()
-
-
-def test_no_surface_no_irradiance():
-    batch, model = synthetic_batch(), method(scales=3)
-    assert model.features(batch)[:, 10:].any()
-    batch["depth"][:] = 0
-    assert (model.features(batch)[:, 10:] == 0).all()
+    assert irradiance(batch, 4).any()
+    for name in ("photon_valid", "depth"):
+        none = {**batch, name: torch.zeros_like(batch[name])}
+        assert (irradiance(none) == 0).all() and (irradiance(none, 4) == 0).all()
