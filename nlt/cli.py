@@ -68,10 +68,11 @@ def _run(arguments: list[str]) -> int:
         export(options.checkpoint, options.output, options.resolution, options.photons)
     elif options.command == "bench":
         _bench(options)
-    elif options.command == "select":
-        from nlt.evaluation.select import select
+    elif options.command == "stress":
+        from nlt.evaluation.stress import stress
 
-        select(options.config, options.minutes, options.out, options.advice)
+        names = (options.methods, options.suites, options.manifest)
+        stress(options.config, options.out, options.scale, options.data, *names)
     elif options.command == "report":
         from nlt.evaluation.report import draw
 
@@ -145,11 +146,15 @@ def _parser() -> argparse.ArgumentParser:
         # Handed to Lightning's own parser before this one sees it; here for the help.
         commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")
     compare = commands.add_parser("compare", help="a table of all methods: generates, trains, evaluates, times")
-    compare.add_argument("--config", required=True, help="a config of configs/compare, by name or path")
-    compare.add_argument("--out", help="where the results go (default: results/NAME, or NAME-SCALE-DATA if given)")
-    compare.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
-    compare.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
-    compare.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    stress = commands.add_parser("stress", help="where a comparison's methods break: suites of growing severity")
+    for command in (compare, stress):
+        command.add_argument("--config", required=True, help="a config of configs/compare, by name or path")
+        command.add_argument("--out", help="where the results go (default: results/NAME, or NAME-SCALE-DATA if given)")
+        command.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
+        command.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
+        command.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    stress.add_argument("--suites", nargs="+", type=_suite, help="only these suites (default: all)")
+    stress.add_argument("--manifest", default="suites", help="of the suites: a name in configs/stress, or a path")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
     compare.add_argument(
         "--train-images", nargs="+", type=_positive, default=[], metavar="N",
@@ -166,11 +171,6 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("-o", "--output", required=True, help="the torch.export program, such as nlt.pt2")
     export.add_argument("--resolution", type=_positive, default=256, help="of its images (default: 256)")
     export.add_argument("--photons", type=_positive, default=10000, help="that it is given (default: 10000)")
-    select = commands.add_parser("select", help="the smallest model that a scene needs: what varies, what measures say")
-    select.add_argument("--config", required=True, help="a config of configs/select, by name or path")
-    select.add_argument("--minutes", type=float, help="to measure and train in (default: the config's)")
-    select.add_argument("--out", help="where the results go (default: results/select/NAME)")
-    select.add_argument("--advice", action="store_true", help="only say what varies; train nothing")
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
     board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")
@@ -275,6 +275,14 @@ def _experiment(text: str) -> str:
 
     if text not in EXPERIMENTS:
         raise argparse.ArgumentTypeError(f"must be one of {', '.join(EXPERIMENTS)}, is {text!r}")
+    return text
+
+
+def _suite(text: str) -> str:
+    from nlt.data.suites import SUITES
+
+    if text not in SUITES:
+        raise argparse.ArgumentTypeError(f"must be one of {', '.join(SUITES)}, is {text!r}")
     return text
 
 

@@ -218,10 +218,10 @@ def test_material(bsdf, kind, albedo):
 
 def _albedo_of(bsdf, uv):
     """The albedo that sample_points gives a plane of that material at these texture coordinates."""
-    from nlt.scenes.pointcloud import _surface
+    from nlt.scenes.pointcloud import surface
 
     shape = Shape("plane", np.zeros((3, 3)), np.array([[0, 1, 2]]), None, bsdf, None)
-    return _surface(shape, uv)[0]
+    return surface(shape, uv)[0]
 
 
 def test_texture(tmp_path):

@@ -12,7 +12,7 @@ from nlt.rendering.renderer import Renderer
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
-from nlt.scenes.pointcloud import _surface
+from nlt.scenes.pointcloud import surface
 from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
 from nlt.scenes.views import Views
 
@@ -118,7 +118,7 @@ def test_albedo(real):
     for shape in real.scene.shapes.values():
         unlike.setdefault(repr(shape.bsdf), shape)
     for shape in unlike.values():
-        albedo, _ = _surface(shape, uv)
+        albedo, _ = surface(shape, uv)
         assert np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1, shape.id
 
 

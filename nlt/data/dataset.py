@@ -33,15 +33,7 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
         self.directory, self.spec, self.split = directory, spec, split
         self._reader = ShardReader()
-        self._points = [read_points(directory / points_name(k)) for k in range(len(spec.scenes))]
-        self._static = [
-            {
-                "point_material": torch.from_numpy(points["material"].astype(np.int64)),
-                "point_albedo": torch.from_numpy(points["albedo"]),
-                "point_emission": torch.from_numpy(points["emission"]),
-            }
-            for points in self._points
-        ]
+        self._hold([read_points(directory / points_name(k)) for k in range(len(spec.scenes))])
         stored = spec.fields(split)
         self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
         needed = set(stored) if self._wanted is None else self._wanted & set(stored)
@@ -50,6 +42,18 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         if any(self._wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
             needed |= {"translation", "present"}
         self._stored = [name for name in stored if name in needed]
+
+    def _hold(self, points: list[dict[str, np.ndarray]]) -> None:
+        """The point cloud of each scene."""
+        self._points = points
+        self._static = [
+            {
+                "point_material": torch.from_numpy(cloud["material"].astype(np.int64)),
+                "point_albedo": torch.from_numpy(cloud["albedo"]),
+                "point_emission": torch.from_numpy(cloud["emission"]),
+            }
+            for cloud in points
+        ]
 
     def _wants(self, name: str) -> bool:
         return self._wanted is None or name in self._wanted
@@ -75,8 +79,8 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     def _tensors(self, scene: int, stored: dict[str, np.ndarray], index: int) -> dict[str, Tensor]:
         sample = {name: torch.from_numpy(array) for name, array in stored.items()}
         if self._wants("view_direction"):
-            size = self.spec.resolution
-            camera = Camera(stored["camera_matrix"], stored["world_to_view"], size, size)
+            height, width = stored["noisy"].shape[-2:]
+            camera = Camera(stored["camera_matrix"], stored["world_to_view"], width, height)
             sample["view_direction"] = torch.from_numpy(camera.view_directions())
         sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self._wants(k)}
         sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)

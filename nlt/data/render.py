@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from nlt.data.sample import FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import use_variant
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
+from nlt.scenes.description import SceneDescription
 from nlt.scenes.pointcloud import sample_points
 from nlt.scenes.state import rest_state
 from nlt.scenes.views import Views
@@ -24,11 +26,18 @@ _TRIES = 3
 class SampleRenderer:
     """Renders the samples of one scene of a dataset, each from its own seeds."""
 
-    def __init__(self, spec: DatasetSpec, scene: int, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        spec: DatasetSpec,
+        scene: int,
+        threads: int | None = None,
+        build: Callable[[SceneDescription, str], Scene] = Scene,
+    ) -> None:
+        """`build` loads the scene: as its description and the experiment say, unless overridden."""
         use_variant()
         self.spec, self.index = spec, scene
         self.description = spec.descriptions[scene]
-        self.scene = Scene(self.description, spec.experiment)
+        self.scene = build(self.description, spec.experiment)
         self.renderer = Renderer(self.scene, spec.teacher)
         self.views = Views(self.scene)
         self._states: dict[str, Any] | None = None
@@ -65,13 +74,16 @@ class SampleRenderer:
         self, split: str, index: int, rest: bool = False, only: Collection[str] | None = None
     ) -> dict[str, np.ndarray]:
         """One sample, all fields of its split or `only` some. `rest`: in the rest state, for trying out the speed."""
-        spec = self.spec
         camera = self.place(split, index, rest)
-        state = self.scene.state
-        seeds = spec.seeds(split, self.index, index).generate_state(5)
-        noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds)
-        sizes = spec.sizes
-        fields = {name: f for name, f in spec.fields(split).items() if only is None or name in only}
+        fields = {name for name in self.spec.fields(split) if only is None or name in only}
+        return self.view(camera, self.spec.seeds(split, self.index, index), fields)
+
+    def view(self, camera: Camera, seeds: np.random.SeedSequence, names: Collection[str]) -> dict[str, np.ndarray]:
+        """The fields `names` of any view of the scene in its current state; images as large as the camera's."""
+        spec, state = self.spec, self.scene.state
+        noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds.generate_state(5))
+        sizes = spec.sizes | {"H": camera.height, "W": camera.width}
+        fields = {name: field for name, field in FIELDS.items() if name in names}
         moved = np.zeros((sizes["M"], 3), np.float32)
         present = np.zeros(sizes["M"], bool)
         moved[: len(state.present)], present[: len(state.present)] = state.translation, state.present
@@ -87,7 +99,7 @@ class SampleRenderer:
             "reference_a": (spec.reference_spp, half_a),
             "reference_b": (spec.reference_spp, half_b),
         }
-        sample |= {name: self._radiance(camera, *image) for name, image in images.items() if name in fields}
+        sample |= {name: self.radiance(camera, *image) for name, image in images.items() if name in fields}
         if not fields.keys().isdisjoint(("depth", "normal", "albedo")):
             sample |= self.renderer.gbuffer(camera)
         if any(name.startswith("photon_") for name in fields):
@@ -97,7 +109,12 @@ class SampleRenderer:
             for name, field in fields.items()
         }
 
-    def _radiance(self, camera: Any, spp: int, seed: int) -> np.ndarray:
+    def radiance(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
+        """Path-traced radiance (3, H, W).
+
+        Raises:
+            UserError: it is not finite, three times.
+        """
         for attempt in range(_TRIES):
             image = self.renderer.radiance(camera, spp, (seed + attempt) % 2**32)
             if np.isfinite(image).all():

@@ -26,6 +26,7 @@ from nlt.evaluation.gallery import FAILURES, Shown, failures
 from nlt.evaluation.packing import max_error, pack_to_fit
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
+from nlt.evaluation.stress_report import STRESS
 from nlt.evaluation.tables import Table, heading, tables, text
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
@@ -317,7 +318,9 @@ def _failures(results: Results) -> str:
 
 def _figures(results: Results) -> str:
     """The pictures beside the results, as vectors where there are both."""
-    found = {path.stem: path for path in sorted(results.directory.glob("*.[ps][nv]g"))}  # .svg comes after .png
+    places = (results.directory, results.directory / STRESS)
+    # .svg comes after .png
+    found = {path.stem: path for place in places for path in sorted(place.glob("*.[ps][nv]g"))}
     return "\n".join(
         f'<figure><img alt="{escape(name.replace("_", " "))}" src="{_picture(path)}">'
         f"<figcaption>{escape(name.replace('_', ' ').capitalize())}</figcaption></figure>"

@@ -10,6 +10,7 @@ from nlt.evaluation.gallery import Shown, draw_failures, draw_qualitative
 from nlt.evaluation.learning_curves import draw_learning_curves
 from nlt.evaluation.page import write_page
 from nlt.evaluation.results import load
+from nlt.evaluation.stress_report import STRESS, draw_stress
 from nlt.evaluation.tables import write_tables
 
 
@@ -30,4 +31,5 @@ def draw(directory: str | Path) -> None:
     if images := Shown.load(results):
         draw_qualitative(images)
         draw_failures(images)
+    draw_stress(results.directory / STRESS)
     write_page(results, claims)

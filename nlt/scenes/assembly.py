@@ -146,13 +146,9 @@ class Scene:
 
     def _light_shape(self) -> Shape:
         """The moving light's quad, so that points are sampled on it too."""
-        light = self.description.light
-        assert light is not None
         # Its own BSDF and emitter: others beside them would join every virtual call of a compiled kernel.
-        (rectangle,) = [s for s in self.mi_scene.shapes() if s.is_emitter()]
-        corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-        vertices = corners * [*light.size, 1] @ _facing_down(self.description.up).T + light.centre
-        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        (rectangle,) = [s for s in self.mi_scene.shapes() if s.id() == f"emitter_{MOVING_LIGHT}"]
+        vertices, faces = light_quad(self.description)
         return Shape(MOVING_LIGHT, vertices, faces, None, rectangle.bsdf(), rectangle.emitter())
 
     def _light_transform(self, translation: np.ndarray, scale: float = 1.0) -> Any:
@@ -207,6 +203,15 @@ class Scene:
         return (vertices.min(0) + vertices.max(0)) / 2
 
 
+def light_quad(description: SceneDescription) -> tuple[np.ndarray, np.ndarray]:
+    """The moving light where its translation is zero: vertices (4, 3) in metres, faces (2, 3)."""
+    light = description.light
+    assert light is not None
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    vertices = corners * [*light.size, 1] @ _facing_down(description.up).T + light.centre
+    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
 def _some(names: set[str]) -> str:
     listed = sorted(names)
     return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
@@ -245,11 +250,15 @@ def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True)
     )
 
 
-def _without_emitter(mesh: Any, shape: Shape) -> Any:
-    """The same mesh, turned off: an emitter of zero radiance would still be sampled and add noise."""
+def read_triangles(mesh: Any) -> Triangles:
+    """A live mesh, in the scene's units."""
     old = mi.traverse(mesh)
     column = lambda key, n: np.array(old[key]).reshape(-1, n)
     normals = column("vertex_normals", 3) if mesh.has_vertex_normals() else None
     uv = column("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None
-    triangles = Triangles(column("vertex_positions", 3), column("faces", 3), normals, uv)
-    return live_mesh(shape.id, triangles, shape.bsdf)
+    return Triangles(column("vertex_positions", 3), column("faces", 3), normals, uv)
+
+
+def _without_emitter(mesh: Any, shape: Shape) -> Any:
+    """The same mesh, turned off: an emitter of zero radiance would still be sampled and add noise."""
+    return live_mesh(shape.id, read_triangles(mesh), shape.bsdf)

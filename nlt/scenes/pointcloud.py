@@ -53,7 +53,7 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
                     f"seen from it; move the box into the room, or take the surroundings out of the scene"
                 )
             width = min(int(1.1 * (count - found) * max(tried, 1) / max(found, 1)) + 64, _BATCH)
-            which, position, uv = _candidates(shapes, width, rng)
+            which, position, uv = uniform_points(shapes, width, rng)
             seen = np.flatnonzero(in_sight(position, owners[which] >= 0))
             kept.append((which[seen], position[seen], uv[seen]))
             found, tried = found + len(seen), tried + width
@@ -70,11 +70,11 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
     for k in np.unique(which):
         mine = which == k
         points["material"][mine] = MATERIALS.index(material(shapes[k].bsdf))
-        points["albedo"][mine], points["emission"][mine] = _surface(shapes[k], uv[mine])
+        points["albedo"][mine], points["emission"][mine] = surface(shapes[k], uv[mine])
     return points
 
 
-def _candidates(shapes: list[Shape], count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def uniform_points(shapes: list[Shape], count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Points uniform by area: shape (count,), position (count, 3) in metres, texture coordinates (count, 2).
 
     Shapes are drawn by area, then triangles by area, then a uniform point in the triangle.
@@ -160,7 +160,7 @@ def diffuse_albedo(bsdf: Any, interaction: Any, active: Any = True) -> Any:
     return dr.select(diffuse & active, dr.clip(value, 0, 1), 0)
 
 
-def _surface(shape: Shape, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surface(shape: Shape, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Albedo and emitted radiance (n, 3) at texture coordinates (n, 2) of a shape."""
 
     def kernel(uv: Any) -> tuple:

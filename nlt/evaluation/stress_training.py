@@ -1,0 +1,127 @@
+"""The stress suite "training": short trainings with other seeds, learning rates, precision and damaged samples."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+import yaml
+
+from nlt.data.files import write_bytes
+from nlt.data.spec import merge, read_configs
+from nlt.errors import DivergedError, UserError
+from nlt.evaluation.comparison import Comparison, untrained
+from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
+from nlt.evaluation.stress_report import STRESS, TRAININGS
+from nlt.evaluation.trainings import Training, train
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
+
+SEED, RATE, PRECISION, CORRUPTED = "seed", "learning rate", "precision", "corrupted samples"
+
+
+class Corruption(L.Callback):
+    """Fireflies in the targets of a share of the samples, the same ones at every epoch."""
+
+    def __init__(self, share: float, factor: float = 1e4, one_in: int = 100) -> None:
+        self.every, self.factor, self.one_in = max(1, round(1 / share)), factor, one_in
+
+    def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
+        """Multiply the radiance of one pixel in `one_in`."""
+        for k in torch.nonzero(batch["index"] % self.every == 0).flatten().tolist():
+            batch["noisy"][k].view(3, -1)[:, k % self.one_in :: self.one_in] *= self.factor
+
+
+@dataclass
+class _Varied(Comparison):
+    """A comparison with one more config over each method's own."""
+
+    over: Path | None = None
+
+    def configs(self, method: str) -> list[str]:
+        return [*super().configs(method), str(self.over)]
+
+
+def train_suite(
+    directory: Path,
+    comparison: Comparison,
+    content: Mapping[str, Any],
+    runs: Path,
+    error: Callable[[Method], float],
+    device: torch.device,
+) -> None:
+    """Train a method of each class in every variation, and write training.csv: a row each, with its relative `error`.
+
+    Raises:
+        UserError: the scale has no trainer.max_steps.
+    """
+    kept = {(row["method"], row["run"]): row["error"] for row in _old(directory / TRAININGS)}
+    jobs: list[tuple[dict[str, Any], Training]] = []
+    for method in _one_of_a_kind(comparison):
+        config = read_configs(comparison.configs(method))
+        for variation, value, seed, over in _variations(config, content, comparison):
+            file = runs / STRESS / f"{method}-{variation}-{value}.yaml".replace(" ", "_").replace("/", "_")
+            write_bytes(file, yaml.safe_dump(over).encode())
+            own = {field.name: getattr(comparison, field.name) for field in fields(Comparison)}
+            training = Training.of(_Varied(**own, over=file), method, seed, runs / STRESS)
+            jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
+    died = train([training for _, training in jobs], "local", None, {})
+    rows = []
+    for row, training in jobs:
+        row |= {"status": FAILED if training in died else OK, "message": died.get(training, "")}
+        row["run"] = training.run.name
+        known = kept.get((training.method, training.run.name))
+        try:
+            if row["status"] == OK:
+                row["error"] = error(training.load(device)[0]) if known is None else known
+        except DivergedError as problem:
+            row |= {"status": DIVERGED, "message": str(problem)}
+        rows.append(row)
+    write_rows(directory / TRAININGS, rows)
+
+
+def _old(path: Path) -> list[dict[str, Any]]:
+    return [row for row in read_rows(path) if row["status"] == OK] if path.exists() else []
+
+
+def _one_of_a_kind(comparison: Comparison) -> list[str]:
+    """The first trained method of each class and set of inputs."""
+    found: dict[str, str] = {}
+    for method in comparison.methods:
+        if not untrained(method):
+            model = read_configs([comparison.configs(method)[1]])["model"]
+            kind = {
+                k: v for k, v in model.get("init_args", {}).items() if not isinstance(v, int) or isinstance(v, bool)
+            }
+            found.setdefault(f"{model['class_path']} {kind}", method)
+    return list(found.values())
+
+
+def _variations(
+    config: Mapping[str, Any], content: Mapping[str, Any], comparison: Comparison
+) -> list[tuple[str, str, int, dict[str, Any]]]:
+    """What varies, how it is called, the seed, and the config over the method's own."""
+    steps = config.get("trainer", {}).get("max_steps")
+    if not steps:
+        raise UserError(f"{comparison.scale}: trainer.max_steps: missing; the suite training takes a share of it")
+    default = inspect.signature(RenderingModule).parameters["learning_rate"].default
+    rate = config["model"].get("init_args", {}).get("learning_rate", default)
+    steps = max(1, round(content["share"] * steps))
+    base = {"trainer": {"max_steps": steps, "limit_val_batches": 0, "precision": "32-true"}}
+    trainer = lambda **more: merge(base, {"trainer": more})
+    first = comparison.seeds[0]
+    damage = {"class_path": f"{__name__}.{Corruption.__name__}", "init_args": {"share": content["corrupted"]}}
+    return [
+        *((SEED, str(seed), seed, base) for seed in range(first, first + content["seeds"])),
+        *(
+            (RATE, f"x{factor:g}", first, merge(base, {"model": {"init_args": {"learning_rate": rate * factor}}}))
+            for factor in content["learning_rate"]
+        ),
+        (PRECISION, content["precision"], first, trainer(precision=content["precision"])),
+        (CORRUPTED, f"{content['corrupted']:.0%}", first, trainer(callbacks=[damage])),
+    ]

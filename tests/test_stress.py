@@ -1,0 +1,334 @@
+"""The stress suites: what a manifest may say, what each change does to scene, points and camera."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from generated import spec_of
+from safetensors import safe_open
+from synthetic import PHOTONS, POINTS, synthetic_batch
+
+from nlt.cli import main
+from nlt.data.render import SampleRenderer
+from nlt.data.spec import merge
+from nlt.data.suites import load_suites
+from nlt.data.variants import MESHES, PLACES, ChangedScene, Stage
+from nlt.errors import UserError
+from nlt.evaluation.paper import label
+from nlt.evaluation.results import read_rows
+from nlt.evaluation.stress import _mirrored, _photons, _points, _shifted, _spp, _turned
+from nlt.evaluation.stress_report import breaking_point
+from nlt.models.module import PROJECTION
+from nlt.models.projection import visible_pixels
+from nlt.paths import CONFIGS
+
+pytest_plugins = ["training_fixtures"]
+
+MANIFEST = CONFIGS / "stress" / "suites.yaml"
+
+
+def test_the_manifest_names_changes_that_there_are():
+    suites = load_suites("suites")
+    known = {*MESHES, *PLACES, "points", "photons", "pixels", "spp", "shifted", "turned", "mirrored"}
+    assert {ladder.change for ladder in suites.ladders} == known
+    assert len({(ladder.suite, ladder.name) for ladder in suites.ladders}) == len(suites.ladders)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colour": {}}, "colour: unknown key"),
+        ({"light": None}, "light"),
+        ({"views": 0}, "views: must be a whole number of at least 1"),
+        ({"camera": {"near": {"change": "near", "values": [], "says": ""}}}, r"camera.near.values: must be a list"),
+        ({"camera": {"near": {"change": "near", "values": [1]}}}, "camera.near: says: missing"),
+    ],
+)
+def test_a_wrong_manifest(tmp_path, change, message):
+    file = tmp_path / "suites.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(MANIFEST.read_text()) | change))
+    with pytest.raises(UserError, match=message):
+        load_suites(str(file))
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return dataclasses.replace(spec_of(), test=4, points=600, experiment="moving_lights", resolution=32)
+
+
+@pytest.fixture(scope="module")
+def stage(spec):
+    render = SampleRenderer(spec, 0)
+    return Stage(render, render.points(), seed=0)
+
+
+def centre_pixel(stage, camera):
+    """Distance along the axis and cosine to the surface of what is in the image's middle."""
+    size = dataclasses.replace(camera, matrix=np.array([[1e3, 0, 0.5], [0, 1e3, 0.5], [0, 0, 1.0]]), width=1, height=1)
+    buffers = stage.render.renderer.gbuffer(size)
+    cosine = abs(buffers["normal"][:, 0, 0] @ camera.rotation[:, 2])
+    return float(buffers["depth"][0, 0, 0]), float(cosine)
+
+
+@pytest.mark.parametrize("metres", [1.0, 0.25, 0.05])
+def test_near(stage, metres):
+    depth, _ = centre_pixel(stage, stage.place(1, "near", metres))
+    assert depth == pytest.approx(metres, rel=0.03)
+
+
+@pytest.mark.parametrize("degrees", [30, 6])
+def test_grazing(stage, degrees):
+    before = stage.place(1)
+    camera = stage.place(1, "grazing", degrees)
+    depth, cosine = centre_pixel(stage, camera)
+    assert not np.array_equal(camera.world_to_view, before.world_to_view)
+    assert depth == pytest.approx(0.75, rel=0.03)
+    assert np.degrees(np.arcsin(cosine)) == pytest.approx(degrees, abs=1)
+
+
+def test_lenses(stage):
+    base = stage.place(0)
+    wide = stage.place(0, "field_of_view", 120)
+    assert wide.fov == pytest.approx(120, abs=1e-3) and np.array_equal(wide.world_to_view, base.world_to_view)
+    more = stage.place(0, "resolution", 1.5)
+    assert (more.width, more.height) == (48, 48) and more.fov == pytest.approx(base.fov, abs=1e-3)
+    flat = stage.place(0, "aspect", 4)
+    assert (flat.width, flat.height) == (64, 16) and flat.fov == pytest.approx(base.fov, abs=1e-3)
+    # Square pixels, and the axis through the middle.
+    assert flat.matrix[0, 0] == flat.matrix[1, 1] and np.allclose(flat.matrix[:2, 2], [32, 8])
+
+
+def test_corner(stage):
+    low, high = stage.render.description.room
+    position = stage.place(0, "corner", 0.5).position
+    assert np.allclose(np.minimum(position - low, high - position)[[0, 2]], 0.5, atol=1e-5)
+
+
+def test_turned_from_light(stage):
+    camera = stage.place(0, "turned_from_light", 140)
+    light = stage.scene._centres  # not of the light: it is where the description and the state say
+    assert "moving_light" in light
+    to_light = stage.render.description.light.centre + stage.scene.state.translation[-1] - camera.position
+    level = [camera.rotation[[0, 2], 2], to_light[[0, 2]]]
+    cosine = level[0] @ level[1] / np.prod([np.linalg.norm(v) for v in level])
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(140, abs=0.1)
+
+
+def test_states_beyond_training(stage):
+    movables, up = stage.scene.movables, 1
+    stage.place(2, "light_lowered", 0.7)
+    assert stage.scene.state.translation[-1, up] == pytest.approx(movables[-1].box[0, up] - 0.7)
+    stage.place(2, "object_outside", 0.5)
+    outside = [
+        max((t - m.box[1]).max(), (m.box[0] - t).max())
+        for m, t, p in zip(movables, stage.scene.state.translation, stage.scene.state.present, strict=True)
+        if p
+    ]
+    assert max(outside) == pytest.approx(0.5, abs=1e-5) and sorted(outside)[-2] <= 1e-5
+    stage.place(2, "objects_removed", 1.0)
+    assert stage.scene.state.present.tolist() == [False] * (len(movables) - 1) + [True]
+    stage.place(2, "objects_crowded", 0.95)
+    assert stage.scene.state.present.all()
+    stage.place(2)  # nothing of it stays
+    expected = stage.render.spec.states(0)["test"][2]
+    assert stage.scene.state.key == expected.key
+
+
+def test_lights_of_the_same_power(stage):
+    """Photons carry it: as much of a light of any size, 4 times as much of one 4 times as bright, red of a red one."""
+
+    def power(change=None, value=1.0):
+        stage.place(3, change, value)
+        photons = stage.render.renderer.photons(2000, 1)
+        side = np.ptp(photons["photon_origin"], 0)[[0, 2]].max()
+        lit = stage.lit_points()["emission"]
+        return photons["photon_flux"].sum(0), side, lit[lit.any(1)].mean(0), stage.lit_points()["position"]
+
+    flux, side, emission, _ = power()
+    small, small_side, small_emission, points = power("light_size", 0.5)
+    np.testing.assert_allclose(small, flux, rtol=0.02)
+    assert small_side == pytest.approx(side / 2, rel=0.02)
+    np.testing.assert_allclose(small_emission, 4 * emission, rtol=1e-5)
+    lit = stage.points["object"] == len(stage.scene.movables) - 1
+    assert np.ptp(points[lit], 0)[0] == pytest.approx(np.ptp(stage.points["position"][lit], 0)[0] / 2, rel=1e-4)
+    bright, _, bright_emission, _ = power("light_power", 4)
+    np.testing.assert_allclose(bright, 4 * flux, rtol=0.02)
+    np.testing.assert_allclose(bright_emission, 4 * emission, rtol=1e-5)
+    red, *_ = power("light_colour", 1.0)
+    np.testing.assert_allclose(red / flux, [2.4, 0.4, 0.2], rtol=0.03)
+    again, *_ = power()
+    np.testing.assert_allclose(again, flux, rtol=0.02)
+
+
+@pytest.mark.parametrize("change", sorted(MESHES))
+def test_points_of_changed_scenes(spec, stage, change):
+    """They lie on the changed meshes, row by row those of training where nothing changed, with what is known there."""
+    scene = ChangedScene(stage.render.description, spec.experiment, change, 0.5, stage.points, seed=0)
+    points = scene.moved_points(stage.points)
+    other = {name for name in points if not np.array_equal(points[name], stage.points[name])}
+    assert other and points.keys() == stage.points.keys()
+    assert all(points[name].shape == stage.points[name].shape for name in points)
+    assert all(points[name].dtype == stage.points[name].dtype for name in points)
+    same = (points["position"] == stage.points["position"]).all(1)
+    assert same.any()
+    if change in ("mesh_replaced", "mesh_thinner", "second_light"):
+        assert not same.all()
+    for k, name in enumerate(scene._names):
+        mine = points["position"][(points["shape"] == k) & ~same]
+        if len(mine):
+            mesh = trimesh.Trimesh(scene.shapes[name].vertices, scene.shapes[name].faces, process=False)
+            _, distance, _ = trimesh.proximity.closest_point_naive(mesh, mine[:4])
+            assert distance.max() < 1e-4
+    if change == "second_light":
+        assert len(scene.mi_scene.emitters()) == 2
+        lit = points["emission"].any(1)
+        assert np.ptp(points["position"][lit & (points["object"] == -1)], 0)[1] < 1e-5
+
+
+# --- what is computed from the clean views ---
+
+
+def test_frames_of_the_world():
+    """Pixels of points stay as they are under a rigid motion, and are mirrored by the mirrored camera."""
+    double = lambda batch: {k: v.double() if v.is_floating_point() else v for k, v in batch.items()}
+    batch = double(synthetic_batch(size=13))
+    up, middle = torch.tensor([0.0, 1, 0]).double(), torch.tensor([1.0, 2, 3]).double()
+    pixels = lambda b: visible_pixels(b["point_position"], b["point_visible"], **{name: b[name] for name in PROJECTION})
+    expected = pixels(batch)
+    for change, value in ((_shifted, 3.0), (_turned, 70.0)):
+        moved = change(batch, value, up, middle)
+        assert not torch.allclose(moved["point_position"], batch["point_position"])
+        assert torch.equal(pixels(moved), expected)
+    half = _turned(batch, 180.0, up, middle)["point_position"]
+    about = torch.tensor([2.0, 0, 6]).double() + batch["point_position"] * torch.tensor([-1, 1, -1])
+    torch.testing.assert_close(half, about)
+    flipped = pixels(double(_mirrored(batch | {"camera_matrix": batch["camera_matrix"].float()}, 1, up, middle)))
+    row, column = expected // 13, expected % 13
+    assert torch.equal(flipped, torch.where(expected < 169, row * 13 + 12 - column, expected))
+
+
+def test_budgets():
+    batch = synthetic_batch()
+    batch |= {f"input_{n}": torch.full_like(batch["noisy_input"], n) for n in (1, 2, 3)}
+    quarter = batch["point_visible"] & (torch.arange(POINTS) < POINTS // 4)
+    assert torch.equal(_points(batch, 0.25)["point_visible"], quarter)
+    fewer = _photons(batch, 0.5)
+    assert fewer["photon_hit"].shape[1] == PHOTONS // 2
+    chosen = [any(torch.equal(hit, other) for other in batch["photon_hit"][0]) for hit in fewer["photon_hit"][0]]
+    assert all(chosen)
+    torch.testing.assert_close(fewer["photon_flux"].sum(1), batch["photon_flux"].sum(1), rtol=0.2, atol=0)
+    assert _photons(batch, 0)["photon_flux"].shape[1] == 0
+    mixed = _spp(batch, 2.5)["noisy_input"]
+    assert set(mixed.unique().tolist()) == {2.0, 3.0} and mixed.mean().item() == pytest.approx(2.5, abs=0.15)
+    assert (_spp(batch, 1)["noisy_input"] == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("growth", "point"),
+    [([1, 1.5, 2.5, 9, 9, 9], 1.5), ([1, 3], 0.5), ([1, 1.9, 1.2, 0.5], np.inf), ([1, 1, 2, 1], 2), ([], np.inf)],
+)
+def test_breaking_point(growth, point):
+    assert breaking_point(np.array(growth)) == pytest.approx(point)
+
+
+# --- the command ---
+
+
+@pytest.fixture(scope="module")
+def stressed(tiny, tmp_path_factory):
+    """`nlt stress` of three methods at a tiny scale, a ladder or none of a suite: its arguments and its directory."""
+    folder = tmp_path_factory.mktemp("stress")
+    content = yaml.safe_load(MANIFEST.read_text()) | {"views": 2, "traced": [1]}
+    content["materials"] = {}
+    for suite, name in {"light": "brighter", "geometry": "thinner", "camera": "aspect"}.items():
+        content[suite] = {name: content[suite][name] | {"values": content[suite][name]["values"][-1:]}}
+    content["flicker"] |= {"draws": 2, "frames": 3}
+    content["training"] |= {"share": 1.0, "seeds": 2, "learning_rate": [10]}
+    manifest = folder / "manifest.yaml"
+    manifest.write_text(yaml.safe_dump(content))
+    scale = folder / "scale.yaml"
+    scale.write_text(yaml.safe_dump(merge(yaml.safe_load(tiny.scale.read_text()), {"trainer": {"max_steps": 4}})))
+    config = folder / "compare.yaml"
+    methods = ["denoising_1_4", "nlt_photons", "path_tracing_1"]
+    config.write_text(yaml.safe_dump({"data": str(tiny.data), "scale": str(scale), "methods": methods}))
+    out = folder / "results"
+    command = ["stress", "--config", str(config), "--out", str(out), "--manifest", str(manifest)]
+    here = os.getcwd()
+    os.chdir(folder)
+    try:
+        assert main(command) == 0
+        yield SimpleNamespace(command=command, directory=out / "stress", folder=folder, methods=methods)
+    finally:
+        os.chdir(here)
+
+
+def test_rows(stressed):
+    rows = read_rows(stressed.directory / "stress.csv")
+    ladders = {method: {row["ladder"] for row in rows if row["method"] == method} for method in stressed.methods}
+    shared = {"views", "brighter", "thinner", "aspect", "shifted", "turned", "mirrored"}
+    shared |= {"camera", "light", "object"}
+    assert ladders["path_tracing_1"] == shared
+    assert ladders["denoising_1_4"] == shared | {"pixels", "spp", "noise"}
+    assert ladders["nlt_photons"] == shared | {"points", "photons"}
+    assert all(row["nonfinite"] == 0 for row in rows)
+    # A shift of the world only reaches those that are fed with positions.
+    for method in stressed.methods:
+        at: dict[str, list[float]] = {"views": [], "shifted": []}
+        for row in rows:
+            if row["method"] == method and (row["ladder"], row["severity"]) in (("views", 0), ("shifted", 5)):
+                at[row["ladder"]].append(row["unbiased_mse"])
+        if method == "nlt_photons":
+            assert at["shifted"] != pytest.approx(at["views"], rel=1e-6)
+        else:
+            assert at["shifted"] == pytest.approx(at["views"], rel=1e-3)
+    assert {path.name for path in stressed.directory.glob("*.*")} >= {
+        "stress.csv", "training.csv", "breaking.csv", "stress.md", "manifest.json", "stress_curves.png",
+        "stress_map.png", "stress_worst.png",
+    }  # fmt: skip
+
+
+def test_a_row_is_its_image(stressed, tiny):
+    """The radiance of path tracing needs no method: its error, computed here from the stored views alone."""
+    rows = read_rows(stressed.directory / "stress.csv")
+    (folder,) = tiny.dataset.parent.glob("*-stress-*")
+    with safe_open(folder / "000" / "light-brighter-1.safetensors", "numpy") as file:
+        f, a, b = (file.get_tensor(name).astype(float) for name in ("traced_1", "reference_a", "reference_b"))
+    found = [r for r in rows if (r["method"], r["ladder"]) == ("path_tracing_1", "brighter")]
+    product = (f - a) * (f - b)  # the room's exposure is 1
+    np.testing.assert_allclose([r["unbiased_mse"] for r in found], product.mean((1, 2, 3)), rtol=1e-5)
+    relative = product / (((a + b) / 2) ** 2 + 0.01)
+    np.testing.assert_allclose([r["error"] for r in found], relative.mean((1, 2, 3)), rtol=1e-5)
+
+
+def test_trainings(stressed):
+    rows = read_rows(stressed.directory / "training.csv")
+    methods = {"denoising_1_4", "nlt_photons"}
+    assert {row["method"] for row in rows} == methods
+    variations = [(row["variation"], row["value"]) for row in rows if row["method"] == "nlt_photons"]
+    seeds, others = [("seed", 0), ("seed", 1)], [("precision", "bf16-mixed"), ("corrupted samples", "2%")]
+    assert variations == [*seeds, ("learning rate", "x10"), *others]
+    assert all(row["status"] == "ok" and np.isfinite(row["error"]) for row in rows)
+
+
+def test_words(stressed):
+    text = (stressed.directory / "stress.md").read_text()
+    for method in stressed.methods:
+        assert label(method) in text
+    assert "0 pixels are not finite" not in text and "Every output is finite." in text
+
+
+def test_again_changes_nothing(stressed, monkeypatch):
+    """The second time nothing is rendered, trained or judged, and no byte of what is drawn changes."""
+    names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.png")
+    before = {name: (stressed.directory / name).read_bytes() for name in names}
+    monkeypatch.setattr("nlt.data.stress.Local", None)
+    monkeypatch.setattr("nlt.evaluation.stress._Views.judge", None)
+    assert main(stressed.command) == 0
+    assert {name: (stressed.directory / name).read_bytes() for name in names} == before
