@@ -68,6 +68,10 @@ def _run(arguments: list[str]) -> int:
         export(options.checkpoint, options.output, options.resolution, options.photons)
     elif options.command == "bench":
         _bench(options)
+    elif options.command == "select":
+        from nlt.evaluation.select import select
+
+        select(options.config, options.minutes, options.out, options.advice)
     elif options.command == "stress":
         from nlt.evaluation.stress import stress
 
@@ -171,6 +175,11 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("-o", "--output", required=True, help="the torch.export program, such as nlt.pt2")
     export.add_argument("--resolution", type=_positive, default=256, help="of its images (default: 256)")
     export.add_argument("--photons", type=_positive, default=10000, help="that it is given (default: 10000)")
+    select = commands.add_parser("select", help="the smallest model that a scene needs: what varies, what measures say")
+    select.add_argument("--config", required=True, help="a config of configs/select, by name or path")
+    select.add_argument("--minutes", type=float, help="to measure and train in (default: the config's)")
+    select.add_argument("--out", help="where the results go (default: results/select/NAME)")
+    select.add_argument("--advice", action="store_true", help="only say what varies; train nothing")
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
     board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")

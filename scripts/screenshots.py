@@ -44,6 +44,7 @@ def main() -> None:
             executable_path=shutil.which("chromium"), args=["--no-sandbox"] if os.geteuid() == 0 else []
         )
         page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(120_000)
         report(page, directory, folder / "report.png")
         dashboard(page, directory, folder / "dashboard.png")
         browser.close()

@@ -12,7 +12,7 @@ PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_and_tests_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)  # what a user would type or write
-    files = re.findall(r"\b(?:nlt|tests|configs|scripts|benchmarks)/[\w/.-]*\w", text)
+    files = re.findall(r"(?<![\w/])(?:nlt|tests|configs|scripts|benchmarks)/[\w/.-]*\w", text)
     links = re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
     assert files or links
     missing = [file for file in files if not (PROJECT / file).exists()]

@@ -1,6 +1,12 @@
 """`nlt select`: what varies against facts found independently; the statistics of the choice; the search end to end."""
 
+import csv
 import itertools
+import json
+import math
+import re
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -9,18 +15,23 @@ import pytest
 import torch
 import yaml
 from scipy import stats
+from tiny import SCALE, write
 
 from nlt.baselines.feature_projection import FeatureProjection
+from nlt.cli import main
 from nlt.data.render import SampleRenderer
-from nlt.data.spec import DatasetSpec
-from nlt.evaluation import advice
+from nlt.data.spec import DatasetSpec, merge
+from nlt.evaluation import advice, clock, search
 from nlt.evaluation.choice import choose, paired_difference, ranked, within
+from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
 from nlt.paths import CONFIGS
 from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import BUILTINS, mitsuba_scene
 from nlt.scenes.description import EXPERIMENTS, load_description
 from nlt.scenes.pointcloud import sample_points
+
+pytest_plugins = ["training_fixtures"]
 
 # ---- what varies ----------------------------------------------------------------------------------------
 
@@ -209,3 +220,174 @@ def test_ranking_against_brute_force():
         assert sorted(order) == list(range(8)) and set(order[: len(front)]) == front
         for a, b in itertools.permutations(points, 2):
             assert not beats(a, b) or order.index(a) < order.index(b)
+
+
+# ---- the search -----------------------------------------------------------------------------------------
+
+SIZES = {"a": {"width": 2, "depth": 1}, "b": {"width": 3, "depth": 2}}
+STEPS, EPOCH, BUDGET_S = 12, 4, 600.0
+
+
+class Killed(BaseException):
+    """No error that the search knows of."""
+
+
+class FakeTime:
+    """Seconds by counted steps: `per_step` for a candidate's width, `setup` for every training."""
+
+    def __init__(self, patch, per_step=1.0, setup=2.0):
+        self.seconds, self.per_step, self.setup, self.begun, self.die = 0.0, per_step, setup, [], math.inf
+        original = search.Search._fit
+
+        def fit(this, run, candidate, seed, steps):
+            self.begun.append((candidate.name, seed, steps, self.seconds))
+            if len(self.begun) == self.die:  # a kill after one more epoch
+                original(this, run, candidate, seed, steps - EPOCH)
+                raise Killed
+            done = original(this, run, candidate, seed, steps)
+            width = SIZES[candidate.size.rpartition("/")[2].removesuffix(".yaml")]["width"]
+            self.seconds += self.setup + done * self.per_step * width
+            return done
+
+        patch.setattr(search, "now", lambda: self.seconds)
+        patch.setattr(search.Search, "_fit", fit)
+        patch.setattr(search.Search, "_step_s", lambda this, module: self.per_step * module.hparams["width"])
+
+
+@pytest.fixture
+def ladder(tiny, tmp_path, monkeypatch, one_thread):
+    """Its config file; the scene is not looked at again, and the clock is brief."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts()])
+    monkeypatch.setattr(clock, "WARM_UP", 1)
+    monkeypatch.setattr(clock, "FRAMES", 3)
+    scale = merge(SCALE, {"trainer": {"max_steps": STEPS, "max_epochs": -1}})
+    sizes = [str(write(tmp_path / f"{name}.yaml", {"model": {"init_args": size}})) for name, size in SIZES.items()]
+    content = {
+        "data": str(tiny.data), "scale": str(write(tmp_path / "scale.yaml", scale)), "methods": ["cnn", "nlt_photons"],
+        "sizes": sizes, "points": [64], "photons": [32, 64], "minutes": BUDGET_S / 60, "seeds": 2,
+    }  # fmt: skip
+    return write(tmp_path / "ladder.yaml", content)
+
+
+def run_select(config, *more, out="out"):
+    assert main(["select", "--config", str(config), "--out", out, *more]) == 0
+    return table(out, "table")
+
+
+def table(out, name):
+    with Path(out, f"{name}.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_end_to_end(ladder, tiny, monkeypatch, capsys):
+    fake = FakeTime(monkeypatch)
+    rows = run_select(ladder)
+    assert len(rows) == 6 and {row["candidate"] for row in rows if row["full"] == "1"} == {
+        "nlt_photons@b, 64 points, 64 photons"
+    }
+    said = capsys.readouterr().out
+    assert "6 of 6 candidates fit" in said and "6 for 4 steps, 3 for 12 steps" in said and "nothing moves" in said
+    # Rungs: every training goes on where it was, the finalists with a second seed.
+    steps = [int(row["steps"]) for row in rows]
+    assert sorted(steps) == [EPOCH] * 3 + [STEPS] * 3 and len(fake.begun) == 6 + 3 + 3
+    (chosen,) = (row for row in rows if row["chosen"] == "1")
+    finals = [row for row in rows if row["steps"] == str(STEPS)]
+    assert chosen in finals and all(row["seeds"] == "2" for row in finals)
+    # The rule, from the stored views alone.
+    views = table("out", "views")
+    good = []
+    for key, sign in (("unbiased_mse", 1), ("mssim", -1)):
+        errors = {row["candidate"]: np.zeros((2, 3)) for row in finals}
+        for view in views:
+            errors[view["candidate"]][int(view["seed"]), int(view["view"])] = sign * float(view[key])
+        good.append(set(within(errors)))
+    eligible = good[0] & good[1] or good[0]
+    fastest = min((r for r in finals if r["candidate"] in eligible), key=lambda r: float(r["time_per_frame_s"]))
+    assert fastest["candidate"] == chosen["candidate"]
+    # The chosen config trains what was chosen.
+    config = yaml.safe_load(Path("out/chosen.yaml").read_text())
+    assert main(["fit", "--config=out/chosen.yaml", "--trainer.max_steps=1", "--trainer.default_root_dir=again"]) == 0
+    assert config["trainer"]["max_steps"] == STEPS
+    module = RenderingModule.load_from_checkpoint(next(Path("again").rglob("*.ckpt")))
+    assert sum(p.numel() for p in module.parameters()) == int(chosen["parameters"])
+    # Confirmed on the test split, by metrics computed anew.
+    confirmed = {row["role"]: row for row in table("out", "confirmed")}
+    assert set(confirmed) == {"chosen", "full model", "best", "by parameters"}
+    assert float(confirmed["full model"]["mssim_worse"]) == 0
+    text = Path("out/table.md").read_text()
+    ratio = float(confirmed["full model"]["time_per_frame_s"]) / float(confirmed["chosen"]["time_per_frame_s"])
+    assert f"- {'holds' if ratio >= 2 else 'FAILS'}: at least 2x cheaper per frame: {ratio:.2f}x" in text
+    for name in ("front.png", "front.svg", "advice.md"):
+        assert Path("out", name).stat().st_size > 100
+    manifest = json.loads(Path("out/manifest.json").read_text())
+    assert manifest["rungs"] == [EPOCH, STEPS] and manifest["seeds"] == [0, 1]
+    # Said again, nothing is trained again.
+    del fake.begun[:]
+    assert [row["candidate"] for row in run_select(ladder) if row["chosen"] == "1"] == [chosen["candidate"]]
+    assert not fake.begun
+    # Killed in the middle of a training and begun again, all is the same.
+    (plan,) = Path("runs").rglob("plan.json")
+    content = plan.read_text()
+    shutil.rmtree("runs")
+    write(plan.parent.mkdir(parents=True) or plan, content)
+    fake.die = 8
+    with pytest.raises(Killed):
+        main(["select", "--config", str(ladder), "--out", "killed"])
+    (record,) = {path for path in plan.parent.rglob("*.ckpt") if path.stat().st_mtime == newest(plan.parent)}
+    assert f"step={STEPS - EPOCH}" in record.name
+    assert run_select(ladder, out="killed") == rows
+
+
+def newest(folder):
+    return max(path.stat().st_mtime for path in folder.rglob("*.ckpt"))
+
+
+@pytest.mark.parametrize("slower", [1.0, 3.0])
+def test_budget(ladder, monkeypatch, capsys, slower):
+    """Fewer candidates for less time; slower trainings exceed it by at most one."""
+    fake = FakeTime(monkeypatch)
+    budget = 100.0
+    measured = search.Search._step_s
+    monkeypatch.setattr(search.Search, "_step_s", lambda this, module: measured(this, module) / slower)
+    run_select(ladder, f"--minutes={budget / 60}")
+    assert "of 6 candidates fit" in capsys.readouterr().out
+    longest = fake.setup + STEPS * 3
+    assert fake.seconds <= budget + longest and all(begun < budget for *_, begun in fake.begun)
+    assert fake.seconds > budget / 4
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"method": ["cnn"]}, "method: unknown key"),
+        ({"methods": ["cnm"]}, "methods: no 'cnm'"),
+        ({"methods": []}, "methods: must be a list of names"),
+        ({"methods": ["oidn_1"]}, "methods: oidn_1 is not trained"),
+        ({"points": [65]}, "points: 65 is more than the 64"),
+        ({"photons": [0]}, "photons: must be at least 1"),
+        ({"photons": [8, 8]}, "photons: has one twice"),
+        ({"minutes": 0}, "minutes: must be a number above 0"),
+        ({"minutes": 1e-3}, "--minutes: 0.001 are too few"),
+        ({"seeds": 0}, "seeds: must be a whole number"),
+        ({"scale": "none"}, "cannot be read"),
+        ({"data": None}, "data: must be the name"),
+    ],
+)
+def test_mistakes(ladder, tmp_path, monkeypatch, capsys, change, said):
+    FakeTime(monkeypatch)
+    config = write(tmp_path / "wrong.yaml", {**yaml.safe_load(ladder.read_text()), **change})
+    assert main(["select", "--config", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and "Traceback" not in error
+
+
+def test_only_advice(tmp_path, monkeypatch, capsys):
+    """The command, on a scene that it looks at in a process of its own."""
+    content = yaml.safe_load((CONFIGS / "select/demo.yaml").read_text())
+    config = write(tmp_path / "advice.yaml", {**content, "data": "static_egg"})
+    monkeypatch.chdir(tmp_path)
+    assert main(["select", "--config", str(config), "--advice"]) == 0
+    said = capsys.readouterr().out
+    assert "light transport: none: feature_projection" in said and "glass" in said
+    assert re.search(r"points: .*\d+% of the pixels", said, re.DOTALL) and not any(tmp_path.glob("results"))

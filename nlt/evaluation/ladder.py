@@ -1,0 +1,194 @@
+"""What a config of configs/select asks for: a ladder of models, from the leanest to the full one."""
+
+from __future__ import annotations
+
+import itertools
+import pydoc
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from nlt.data.files import AnyPath
+from nlt.data.spec import DatasetSpec, load_spec, merge, read_configs
+from nlt.errors import UserError
+from nlt.models.module import RenderingModule
+from nlt.paths import config_names, find_config
+
+_KEYS = ("data", "scale", "methods", "sizes", "points", "photons", "minutes", "seeds")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A rung of the ladder; `points` and `photons` are None where the method reads none."""
+
+    method: str
+    size: str
+    points: int | None
+    photons: int | None
+
+    @property
+    def name(self) -> str:
+        """Such as "nlt@small, 1,024 points"."""
+        counts = ((self.points, "points"), (self.photons, "photons"))
+        return ", ".join([f"{self.method}@{Path(self.size).stem}", *(f"{n:,} {what}" for n, what in counts if n)])
+
+    @property
+    def slug(self) -> str:
+        """The name, for a directory."""
+        parts = (self.method.replace("/", "-"), Path(self.size).stem, self.points, self.photons)
+        return "-".join(str(part) for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The candidates: every method in every size, with every number of points and of photons that it reads.
+
+    `methods` and `sizes` are in the config's order, `points` and `photons` ascend: the last ones make the full model.
+    """
+
+    name: str
+    data: Path
+    scale: Path
+    methods: tuple[str, ...]
+    sizes: tuple[str, ...]
+    points: tuple[int, ...]
+    photons: tuple[int, ...]
+    minutes: float
+    seeds: int
+
+    @classmethod
+    def load(cls, config: str, minutes: float | None = None) -> Ladder:
+        """Read a config by name or path; `minutes` overrides its own.
+
+        Raises:
+            UserError: a key is unknown, missing or wrong.
+        """
+        file = find_config("select", config)
+        content = {"seeds": 1} | read_configs([str(file)]) | ({} if minutes is None else {"minutes": minutes})
+        for key in content:
+            if key not in _KEYS:
+                raise UserError(f"{file}: {key}: unknown key; known are {', '.join(_KEYS)}")
+        for key in _KEYS:
+            if key not in content:
+                raise UserError(f"{file}: {key}: missing")
+        for key in ("data", "scale"):
+            if not isinstance(content[key], str):
+                raise UserError(f"{file}: {key}: must be the name of a config of configs/{key}, is {content[key]!r}")
+        for key, kind in (("methods", "model"), ("sizes", "size")):
+            known = config_names(kind)
+            for name in _list(file, key, content[key], str):
+                if name not in known and not find_config(kind, name).is_file():
+                    raise UserError(f"{file}: {key}: no {name!r} in configs/{kind}; known are {', '.join(known)}")
+        for key in ("points", "photons"):
+            if min(_list(file, key, content[key], int)) < 1:
+                raise UserError(f"{file}: {key}: must be at least 1, is {content[key]}")
+        if not isinstance(content["minutes"], int | float) or content["minutes"] <= 0:
+            raise UserError(f"{file}: minutes: must be a number above 0, is {content['minutes']!r}")
+        if type(content["seeds"]) is not int or content["seeds"] < 1:
+            raise UserError(f"{file}: seeds: must be a whole number of at least 1, is {content['seeds']!r}")
+        ladder = cls(
+            file.stem,
+            find_config("data", content["data"]),
+            find_config("scale", content["scale"]),
+            tuple(content["methods"]),
+            tuple(content["sizes"]),
+            tuple(sorted(content["points"])),
+            tuple(sorted(content["photons"])),
+            content["minutes"],
+            content["seeds"],
+        )
+        ladder._check(file)
+        return ladder
+
+    def _check(self, file: Path) -> None:
+        for key in ("points", "photons"):
+            has, most = getattr(self.spec, key), max(getattr(self, key))
+            if most > has:
+                raise UserError(f"{file}: {key}: {most} is more than the {has} that the dataset has")
+        for split in ("train", "val", "test"):
+            if self.spec.count(split) * len(self.spec.scenes) < 2:
+                raise UserError(f"{self.scale}: data.dataset.{split}: must be at least 2 to select, is fewer")
+        steps = read_configs([str(self.scale)]).get("trainer", {}).get("max_steps")
+        if not isinstance(steps, int) or steps < 1:
+            raise UserError(f"{self.scale}: trainer.max_steps: must be a whole number of at least 1, is {steps!r}")
+        for method in self.methods:
+            kind = pydoc.locate(str(self._config(method, self.sizes[0])["model"].get("class_path")))
+            if not (isinstance(kind, type) and issubclass(kind, RenderingModule)):
+                raise UserError(f"{file}: methods: {method} is not trained; give one that is")
+
+    @cached_property
+    def _loaded(self) -> tuple[DatasetSpec, AnyPath]:
+        return load_spec([str(self.data), str(self.scale)])
+
+    @property
+    def spec(self) -> DatasetSpec:
+        """Of the dataset."""
+        return self._loaded[0]
+
+    @property
+    def root(self) -> AnyPath:
+        """Of datasets."""
+        return self._loaded[1]
+
+    @cached_property
+    def candidates(self) -> list[Candidate]:
+        """The full model first, then so that the first few of them are spread over methods, sizes and counts."""
+        columns = []
+        for method in reversed(self.methods):
+            inputs = self.build(Candidate(method, self.sizes[-1], None, None)).inputs
+            reads = lambda prefix, names=inputs: any(name.startswith(prefix) for name in names)
+            points = self.points if reads("point_") else (None,)
+            photons = self.photons if reads("photon_") else (None,)
+            found = list(itertools.product([method], self.sizes, points, photons))[::-1]
+            order = sorted(range(len(found)), key=lambda k: _van_der_corput(k, len(found)))
+            columns.append([Candidate(*found[k]) for k in order])
+        rows = itertools.zip_longest(*columns)
+        return [candidate for row in rows for candidate in row if candidate]
+
+    @property
+    def full(self) -> Candidate:
+        """The largest."""
+        return self.candidates[0]
+
+    def config(self, candidate: Candidate) -> dict[str, Any]:
+        """What `nlt fit` is to be given to train a candidate."""
+        limits = {}
+        if candidate.points not in (None, self.spec.points):
+            limits["max_points"] = candidate.points
+        if candidate.photons not in (None, self.spec.photons):
+            limits["max_photons"] = candidate.photons
+        return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
+
+    def _config(self, method: str, size: str) -> dict[str, Any]:
+        files = (self.data, find_config("model", method), self.scale, find_config("size", size))
+        return read_configs([str(file) for file in files])
+
+    def build(self, candidate: Candidate) -> RenderingModule:
+        """The candidate, untrained."""
+        model = self.config(candidate)["model"]
+        kind: Any = pydoc.locate(model["class_path"])
+        sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.points}
+        try:
+            module = kind(**{**model.get("init_args", {}), **sizes})
+        except TypeError as error:
+            raise UserError(f"{find_config('model', candidate.method)}: model.init_args: {error}") from None
+        assert isinstance(module, RenderingModule)
+        return module
+
+
+def _list(file: Path, key: str, value: Any, kind: type) -> list[Any]:
+    if not isinstance(value, list) or not value or any(type(each) is not kind for each in value):
+        what = "names" if kind is str else "whole numbers"
+        raise UserError(f"{file}: {key}: must be a list of {what}, is {value!r}")
+    if len(set(value)) < len(value):
+        raise UserError(f"{file}: {key}: has one twice: {value}")
+    return value
+
+
+def _van_der_corput(k: int, count: int) -> int:
+    """A sort key by which the ends of 0..count-1 come first, then the middle, the quarters, and so on."""
+    if k in (0, count - 1):
+        return -2 if k == 0 else -1
+    bits = (count - 1).bit_length()
+    return int(format(k, f"0{bits}b")[::-1], 2)

@@ -1,0 +1,329 @@
+"""Successive halving of a ladder's candidates under a budget of time (Jamieson and Talwalkar 2016)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch.utils.data import DataLoader, default_collate
+
+from nlt import training
+from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.files import write_bytes
+from nlt.data.spec import merge
+from nlt.errors import DivergedError, UserError
+from nlt.evaluation.choice import ranked
+from nlt.evaluation.clock import Clock, summary
+from nlt.evaluation.frames import Frames
+from nlt.evaluation.ladder import Candidate, Ladder
+from nlt.metrics.image_metrics import ImageMetrics
+from nlt.metrics.quantities import METRICS
+from nlt.models.module import RenderingModule
+from nlt.models.policy import Policy, default_device
+from nlt.training import newest_checkpoint, read_checkpoint
+
+SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
+_ETA, _RUNGS = 3, 3  # one in three goes on, at most so often
+_LEAST = 3  # candidates in the last rung
+_ENOUGH = 6  # candidates: below these, rather fewer steps
+_TIMING = 0.1  # of the budget, at most, for the times per frame
+_SETUP = 3.0  # seconds a training takes beside its steps, before that has been measured
+_BATCH = 16
+
+now = time.perf_counter
+Scores = dict[str, list[float]]  # of every image, by the keys of SCORES
+
+
+@dataclass
+class Entry:
+    """What is known of a candidate: times and sizes; scores by seed, after `steps` steps; why it went no further."""
+
+    candidate: Candidate
+    cost: dict[str, Any]
+    steps: int = 0
+    status: str = ""
+
+
+class Search:
+    """Trains a ladder's candidates, the worse of them for a short time only.
+
+    Every decision follows from what lies in `directory`: killed and started again, the search goes on and ends alike.
+    """
+
+    def __init__(self, ladder: Ladder, dataset: Any, root: Path) -> None:
+        self.ladder, self.dataset, self.budget = ladder, dataset, 60.0 * ladder.minutes
+        decides = [ladder.config(candidate) for candidate in ladder.candidates]
+        self.device = default_device()
+        self.policy = Policy.for_device(self.device)
+        key = json.dumps([decides, self.policy.precision, ladder.minutes, ladder.seeds], sort_keys=True)
+        self.directory = root / f"{ladder.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        self.spent = 0.0
+        self.entries: dict[Candidate, Entry] = {}
+        self.seeds = [0]
+        self._overheads: list[float] = []
+        trainer = ladder.config(ladder.full)
+        self._most, batch_size = trainer["trainer"]["max_steps"], trainer["data"].get("batch_size", 32)
+        self._epoch = max(1, len(ladder.spec.scenes) * ladder.spec.train // batch_size)
+        self._batch_size = batch_size
+
+    # --- the plan ---
+
+    def plan(self) -> None:
+        """Measure the candidates and decide how many fit, and the rungs.
+
+        Raises:
+            UserError: the budget is too small for any.
+        """
+        file = self.directory / "plan.json"
+        if not file.exists():
+            write_bytes(file, json.dumps(self._plan()).encode())
+        plan = json.loads(file.read_text())
+        self.rungs, self.spent = plan["rungs"], plan["spent_s"]
+        costs = dict(zip(self.ladder.candidates, plan["costs"], strict=False))
+        self.entries = {candidate: Entry(candidate, cost) for candidate, cost in costs.items()}
+        counts = self._counts(self.rungs)
+        print(
+            f"{len(self.entries)} of {len(self.ladder.candidates)} candidates fit into {self.ladder.minutes:g} min: "
+            + ", ".join(f"{n} for {steps} steps" for n, steps in zip(counts, self.rungs, strict=True))
+            + (f", the last with {self.ladder.seeds} seeds" if self.ladder.seeds > 1 else "")
+            + f"; about {(self.spent + self._cost(self._dearest(), self.rungs)) / 60:.1f} min in all",
+            flush=True,
+        )
+
+    def _plan(self) -> dict[str, Any]:
+        """Step times, in the ladder's order, until no more fit; then times per frame, all taking turns."""
+        begin, rungs = now(), self._steps(self._most)
+        modules: dict[Candidate, RenderingModule] = {}
+        needed = lambda: (self._cost(self._dearest(), rungs) + now() - begin) / (1 - _TIMING)
+        for candidate in self.ladder.candidates:
+            modules[candidate] = self.ladder.build(candidate)
+            self.entries[candidate] = Entry(candidate, {"step_s": self._step_s(modules[candidate])})
+            while needed() > self.budget and len(self.entries) <= _ENOUGH and rungs[-1] > self._epoch:
+                rungs = self._steps(max(rungs[-1] // 2, self._epoch))
+            if needed() > self.budget:
+                if len(self.entries) > 2:
+                    self.entries.popitem()
+                break
+        if needed() > self.budget or len(self.entries) < 2:
+            minutes = math.ceil(2 * needed() / 60)
+            raise UserError(f"--minutes: {self.ladder.minutes:g} are too few for two candidates; give {minutes}")
+        clock = Clock(Frames(self._split("val")), self.device)
+        laps = clock.race({c.slug: modules[c] for c in self.entries}, _TIMING * self.budget)
+        for entry in self.entries.values():
+            entry.cost |= summary(laps[entry.candidate.slug]) | clock.size(modules[entry.candidate])
+        costs = [entry.cost for entry in self.entries.values()]
+        return {"rungs": rungs, "costs": costs, "spent_s": now() - begin}
+
+    def _steps(self, last: int) -> list[int]:
+        """Steps of the rungs, each a third of the next, in whole epochs: so going on is exact."""
+        steps = [max(1, round(last / self._epoch)) * self._epoch if last > self._epoch else last]
+        for k in range(1, _RUNGS):
+            fewer = max(1, round(last / _ETA**k / self._epoch)) * self._epoch
+            if fewer < steps[0]:
+                steps.insert(0, fewer)
+        return steps
+
+    def _step_s(self, module: RenderingModule) -> float:
+        """Seconds of a training step: the least of two, after a first."""
+        data, wanted = self._split("train", module.inputs), self._batch_size
+        batch = default_collate([data[k % len(data)] for k in range(wanted)])
+        batch = {name: value.to(self.device) for name, value in batch.items()}
+        module = module.to(self.device).train()
+        (optimizer,), _ = module.configure_optimizers()
+        seconds = []
+        for _ in range(3):
+            begin = now()
+            with self.policy.applied(self.device):
+                loss = module.loss(module(batch), batch["noisy"], batch["exposure"])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            float(loss.detach())
+            seconds.append(now() - begin)
+        return min(seconds[1:])
+
+    def _counts(self, rungs: list[int]) -> list[int]:
+        """How many candidates are in each rung."""
+        count = len(self.entries)
+        return [max(math.ceil(count / _ETA**k), min(_LEAST, count)) for k in range(len(rungs))]
+
+    def _dearest(self) -> list[Candidate]:
+        return sorted(self.entries, key=lambda c: (c != self.ladder.full, -self.entries[c].cost["step_s"]))
+
+    def _estimate(self, candidate: Candidate, steps: int) -> float:
+        overhead = statistics.median(self._overheads) if self._overheads else _SETUP
+        return overhead + steps * float(self.entries[candidate].cost["step_s"])
+
+    def _cost(self, order: list[Candidate], rungs: list[int], done: int = 0) -> float:
+        """Seconds that the rungs from `done` on take, if the first of `order` go on each time; seeds included."""
+        counts, total = self._counts(rungs), 0.0
+        for k in range(done, len(rungs)):
+            steps = rungs[k] - (rungs[k - 1] if k else 0)
+            total += sum(self._estimate(c, steps) for c in order[: counts[k]])
+        return total + (self.ladder.seeds - 1) * sum(self._estimate(c, rungs[-1]) for c in order[: counts[-1]])
+
+    # --- the search ---
+
+    def run(self) -> list[Candidate]:
+        """Those that were trained longest, each with scores of all `seeds`: at the same number of steps."""
+        self.plan()
+        counts, order, finals = self._counts(self.rungs), list(self.entries), list[Candidate]()
+        for k, steps in enumerate(self.rungs):
+            begun = self.rungs[k - 1] if k else 0
+            alive = []
+            for number, candidate in enumerate(order, 1):
+                estimate = self._estimate(candidate, steps - begun)
+                first = candidate == self.ladder.full and self.spent < self.budget
+                if self.spent + estimate > self.budget and not first:
+                    self.entries[candidate].status = f"no time left after {begun} steps"
+                    continue
+                if self.train(candidate, 0, steps, begun):
+                    alive.append(candidate)
+                left = (self.budget - self.spent) / 60
+                print(f"rung {k + 1} of {len(self.rungs)}, {number} of {len(order)}: {candidate.name}: {steps} steps; "
+                      f"{left:.1f} of {self.ladder.minutes:g} min left", flush=True)  # fmt: skip
+            if not alive:
+                break
+            finals = alive
+            order = self._order(alive)
+            if k + 1 < len(self.rungs):
+                keep = counts[k + 1]
+                while keep > 1 and self.spent + self._cost(order[:keep], self.rungs, k + 1) > self.budget:
+                    keep -= 1
+                for candidate in order[keep:]:
+                    self.entries[candidate].status = f"dropped after {steps} steps"
+                order = order[:keep]
+        if not finals:
+            raise UserError(f"{self.ladder.scale}: every candidate diverged; lower model.init_args.learning_rate")
+        finals = self._more_seeds(finals)
+        for candidate in finals:
+            self.entries[candidate].status = "trained to the end"
+        return finals
+
+    def _more_seeds(self, finals: list[Candidate]) -> list[Candidate]:
+        """Train them with further seeds, as long as there is time for all; those that did not diverge."""
+        steps = self.entries[finals[0]].steps
+        for seed in range(1, self.ladder.seeds):
+            left, done = list(finals), list[Candidate]()
+            while left and self.spent + sum(self._estimate(c, steps) for c in left) <= self.budget:
+                if self.train(left[0], seed, steps, 0):
+                    done.append(left[0])
+                del left[0]
+            print(f"seed {seed}: {len(done)} of {len(finals)} candidates; "
+                  f"{(self.budget - self.spent) / 60:.1f} of {self.ladder.minutes:g} min left", flush=True)  # fmt: skip
+            if left or not done:
+                break
+            finals = done
+            self.seeds.append(seed)
+        return finals
+
+    def _order(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Those worth going on with first; the full model is always the first."""
+        times = {c: float(self.entries[c].cost["time_per_frame_s"]) for c in candidates}
+        order = ranked([self.errors(candidates, key) for key in SCORES], times)
+        return sorted(order, key=lambda c: c != self.ladder.full)
+
+    def train(self, candidate: Candidate, seed: int, steps: int, begun: int) -> bool:
+        """Train on from `begun` to `steps` and score on the validation split; False if it diverges."""
+        run, entry = self.run_of(candidate, seed), self.entries[candidate]
+        record = run / f"{steps}.json"
+        if not record.exists():
+            begin, took = now(), dict[str, Any]()
+            try:
+                done = self._fit(run, candidate, seed, steps)
+                took["scores"] = self.score(run, "val")
+            except DivergedError as error:
+                done, took["diverged"] = steps - begun, str(error)
+            # Where a killed training went on: as if this process had done all the steps.
+            seconds = now() - begin + (steps - begun - done) * entry.cost["step_s"]
+            write_bytes(record, json.dumps({**took, "seconds": seconds}).encode())
+        content = json.loads(record.read_text())
+        self.spent += content["seconds"]
+        if "diverged" in content:
+            entry.status = "diverged"
+            return False
+        self._overheads.append(max(0.0, content["seconds"] - (steps - begun) * entry.cost["step_s"]))
+        entry.steps = steps
+        return True
+
+    def run_of(self, candidate: Candidate, seed: int) -> Path:
+        """The directory of a training."""
+        return self.directory / f"{candidate.slug}-seed{seed}"
+
+    def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
+        """Train up to `steps`; how many of them were done now."""
+        # By epochs: going on after max_steps, Lightning trains on a batch of the epoch before once more.
+        limit = {"max_steps": -1, "max_epochs": steps // self._epoch}
+        if steps < self._epoch:
+            limit = {"max_steps": steps}
+        logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
+        own = {
+            "seed_everything": seed,
+            "model": {"init_args": {"seed": seed}},
+            "data": {"seed": seed},
+            "trainer": {
+                **limit, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
+                "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
+            },
+        }  # fmt: skip
+        file = run / "run.yaml"
+        write_bytes(file, yaml.safe_dump(merge(self.ladder.config(candidate), own)).encode())
+        arguments, before = ["fit", f"--config={file}"], 0
+        if checkpoint := newest_checkpoint(run):
+            before = read_checkpoint(checkpoint)["global_step"]
+            arguments.append(f"--ckpt_path={checkpoint}")
+        if before < steps:
+            training.run_lightning(arguments)
+        return steps - before
+
+    def load(self, run: Path) -> RenderingModule:
+        """A trained candidate."""
+        checkpoint = newest_checkpoint(run)
+        assert checkpoint is not None
+        return RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
+
+    @torch.inference_mode()
+    def score(self, run: Path, split: str) -> Scores:
+        """The scores of every image of a split.
+
+        Raises:
+            DivergedError: a prediction is not finite.
+        """
+        module = self.load(run)
+        metrics, found = ImageMetrics(perceptual=False).to(self.device), []
+        for cpu_batch in DataLoader(self._split(split, module.inputs), batch_size=_BATCH, collate_fn=collated):
+            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
+            with self.policy.applied(self.device):
+                prediction = module(batch)
+            if not prediction.isfinite().all():
+                raise DivergedError(f"a prediction is not finite, among {split} samples {batch['index'].tolist()}")
+            found.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
+        return {key: torch.cat([each[key] for each in found]).tolist() for key in SCORES}
+
+    def _split(self, split: str, inputs: tuple[str, ...] | None = None) -> LightTransportDataset:
+        return LightTransportDataset(self.dataset, self.ladder.spec, split, inputs)
+
+    def scores(self, candidate: Candidate, key: str, seeds: Sequence[int]) -> np.ndarray:
+        """(S, N) on the validation split: seeds and images."""
+        steps = self.entries[candidate].steps
+        found = [json.loads((self.run_of(candidate, s) / f"{steps}.json").read_text()) for s in seeds]
+        return np.array([each["scores"][key] for each in found])
+
+    def errors(self, candidates: list[Candidate], key: str) -> dict[Candidate, np.ndarray]:
+        """Scores of candidates that were trained with all `seeds`, as errors: the lower the better."""
+        return {c: as_error(key, self.scores(c, key, self.seeds)) for c in candidates}
+
+
+def as_error(key: str, scores: np.ndarray) -> np.ndarray:
+    """Scores so that lower is better."""
+    return scores if METRICS[key].direction == "lower" else 1 - scores

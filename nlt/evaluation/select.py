@@ -1,0 +1,148 @@
+"""`nlt select`: the smallest model that a scene needs: from what varies in it, and from what trainings measure."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from nlt.data.files import write_bytes
+from nlt.data.generate import generate
+from nlt.evaluation import advice
+from nlt.evaluation.choice import choose, paired_difference
+from nlt.evaluation.ladder import Candidate, Ladder
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.evaluation.results import write_manifest, write_rows
+from nlt.evaluation.search import SCORES, Search, as_error
+from nlt.evaluation.selection import draw_front, markdown
+from nlt.metrics.quantities import COSTS
+
+Row = dict[str, Any]
+# What each row of confirmed.csv is.
+CHOSEN, FULL, BEST, FEWEST = "chosen", "full model", "best", "by parameters"
+
+
+def select(config: str, minutes: float | None = None, out: str | None = None, only_advice: bool = False) -> Path | None:
+    """Say what varies in a dataset's scenes, then search the ladder; write the results to a directory.
+
+    Raises:
+        UserError: the config is wrong, or the minutes are too few.
+    """
+    start, begun = time.time(), origin()
+    ladder = Ladder.load(config, minutes)
+    facts = advice.measure_facts(ladder.spec)
+    advised = advice.advise(ladder.spec, facts)
+    for each in advised:
+        print(f"{each.subject}: {each.verdict}\n    {each.reason}", flush=True)
+    if only_advice:
+        return None
+    directory = Path(out or Path("results/select") / ladder.name)
+    write_bytes(directory / "advice.md", advice.table(advised, facts).encode())
+    dataset = generate(ladder.spec, ladder.root)
+    search = Search(ladder, dataset, Path("runs") / dataset.name / "select")
+    finals = search.run()
+    times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
+    parameters = {c: float(search.entries[c].cost["parameters"]) for c in finals}
+    errors = [search.errors(finals, key) for key in SCORES]
+    best = min(finals, key=lambda c: errors[0][c].mean())
+    picks = {CHOSEN: choose(errors, times), FULL: ladder.full, BEST: best, FEWEST: choose(errors, parameters)}
+    if ladder.full not in finals:
+        print("the full model was not trained as long as the last: nothing is compared with it", flush=True)
+        del picks[FULL]
+    confirmed = _confirm(search, picks)
+    rows = _rows(search, finals, picks[CHOSEN])
+    write_bytes(directory / "chosen.yaml", _chosen(ladder, picks[CHOSEN]).encode())
+    write_rows(directory / "table.csv", rows)
+    write_rows(directory / "confirmed.csv", confirmed)
+    write_rows(directory / "views.csv", _views(search, finals))
+    record = {
+        **begun,
+        **surroundings(search.device, search.policy),
+        "select": ladder.name,
+        **{key: getattr(ladder, key) for key in ("methods", "sizes", "points", "photons", "minutes")},
+        "seeds": search.seeds,
+        "rungs": search.rungs,
+        "budget_spent_min": round(search.spent / 60, 2),
+        "dataset": dataset.name,
+        "n_val": ladder.spec.val * len(ladder.spec.scenes),
+        "n_test": ladder.spec.test * len(ladder.spec.scenes),
+        "facts": [asdict(fact) for fact in facts],
+        "advice": [asdict(each) for each in advised],
+        "configs": {c.name: ladder.config(c) for c in finals},
+        "wall_time_s": round(time.time() - start, 1),
+    }
+    write_manifest(directory, record)
+    text = markdown(ladder.name, rows, confirmed, record)
+    write_bytes(directory / "table.md", text.encode())
+    draw_front(directory, rows)
+    print(f"\n{text}\nwritten to {directory}; go on with: nlt fit --config {directory}/chosen.yaml", flush=True)
+    return directory
+
+
+def _chosen(ladder: Ladder, candidate: Candidate) -> str:
+    head = f"# {candidate.name}: chosen by `nlt select --config {ladder.name}`, ready for `nlt fit --config`.\n"
+    return head + yaml.safe_dump(ladder.config(candidate), sort_keys=False)
+
+
+def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Row]:
+    """A row per candidate of the ladder; scores are of the validation split, differences from the best's paired."""
+    errors = {key: search.errors(finals, key) for key in SCORES}
+    best = {key: min(each, key={c: e.mean() for c, e in each.items()}.__getitem__) for key, each in errors.items()}
+    rows = []
+    for candidate in search.ladder.candidates:
+        row: Row = {"candidate": candidate.name, **asdict(candidate), "chosen": int(candidate == chosen)}
+        row |= {"full": int(candidate == search.ladder.full), "status": "did not fit"}
+        if entry := search.entries.get(candidate):
+            seeds = search.seeds if candidate in finals else [0]
+            row |= {"status": entry.status, "steps": entry.steps, "seeds": len(seeds)}
+            row |= {key: entry.cost[key] for key in ("step_s", *COSTS, "time_per_frame_error_s") if key in entry.cost}
+            for key in SCORES if entry.steps else ():
+                scores = search.scores(candidate, key, seeds)
+                row[key] = scores.mean()
+                if candidate in finals:
+                    pair = errors[key][candidate], errors[key][best[key]]
+                    row[f"{key}_behind"], row[f"{key}_behind_error"] = paired_difference(*pair)
+        rows.append(row)
+    return rows
+
+
+def _confirm(search: Search, picks: dict[str, Candidate]) -> list[Row]:
+    """The picks on the test split, which nothing has been decided by: scores, and the paired difference from the full
+    model."""
+    found = {c: [_test_scores(search, c, seed) for seed in search.seeds] for c in set(picks.values())}
+    rows = []
+    for role, candidate in picks.items():
+        row: Row = {"role": role, "candidate": candidate.name} | search.entries[candidate].cost
+        for key in SCORES:
+            errors = {c: as_error(key, np.array([each[key] for each in scores])) for c, scores in found.items()}
+            row[key] = float(np.mean([each[key] for each in found[candidate]]))
+            if FULL in picks:
+                mean, error = paired_difference(errors[candidate], errors[picks[FULL]])
+                row |= {f"{key}_worse": mean, f"{key}_worse_error": error}
+        rows.append(row)
+    return rows
+
+
+def _test_scores(search: Search, candidate: Candidate, seed: int) -> dict[str, list[float]]:
+    run = search.run_of(candidate, seed)
+    file = run / f"test-{search.entries[candidate].steps}.json"
+    if not file.exists():
+        write_bytes(file, json.dumps(search.score(run, "test")).encode())
+    return dict(json.loads(file.read_text()))
+
+
+def _views(search: Search, finals: list[Candidate]) -> list[Row]:
+    """Every validation image's scores of those trained longest."""
+    rows = []
+    for candidate in finals:
+        scores = {key: search.scores(candidate, key, search.seeds) for key in SCORES}
+        for s, seed in enumerate(search.seeds):
+            for view in range(scores[SCORES[0]].shape[1]):
+                each = {key: float(values[s, view]) for key, values in scores.items()}
+                rows.append({"candidate": candidate.name, "seed": seed, "view": view, **each})
+    return rows
