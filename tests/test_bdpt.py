@@ -144,7 +144,7 @@ def furnace():
 
 def renderer_of(parts, teacher):
     _ALIVE.append(mi.load_dict({"type": "scene", **parts}))
-    description = SimpleNamespace(units_per_metre=1.0, room=None)
+    description = SimpleNamespace(units_per_metre=1.0, room=None, teacher=teacher)
     return Renderer(SimpleNamespace(mi_scene=_ALIVE[-1], description=description), teacher)
 
 
