@@ -57,8 +57,8 @@ def measure(directory: Path, factor: int) -> dict[str, str | int]:
 
 
 def tiled(array: np.ndarray, factor: int) -> np.ndarray:
-    """Images (V, C, H, W) beside those of the next views, (V, C, factor H, factor W); other arrays as they are."""
-    if array.ndim != 4:
+    """Images (V, ..., H, W) beside those of the next views, (V, ..., factor H, factor W); other arrays as they are."""
+    if array.ndim < 3:
         return array
     rows = [[np.roll(array, factor * i + j, axis=0) for j in range(factor)] for i in range(factor)]
     return np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
