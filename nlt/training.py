@@ -49,11 +49,14 @@ class Checkpoints(ModelCheckpoint):
         super().__init__(filename="{epoch}-{step}", save_top_k=1, save_on_train_epoch_end=True)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Resuming with max_steps, Lightning ends the last epoch anew and would count it twice: the sampler's epoch."""
+        """Resuming with max_steps, Lightning would end the last epoch anew, on a batch more: as with max_epochs."""
         super().on_train_start(trainer, pl_module)
-        progress: Any = trainer.fit_loop.epoch_progress
-        for tracker in (progress.current, progress.total):
-            tracker.processed = tracker.completed
+        loop: Any = trainer.fit_loop
+        if loop.restarted_on_epoch_end:
+            loop.epoch_progress.increment_completed()
+            loop._restarting = loop.epoch_loop.restarting = False
+            loop.reset_restart_stage()
+            loop.epoch_loop.reset_restart_stage()
 
 
 class Predictions(BasePredictionWriter):

@@ -39,14 +39,19 @@ def content(tensors):
 
 
 @pytest.mark.parametrize(
-    ("method", "limit", "legs"),
-    [("nlt_photons", "max_steps", (4, 8, 10)), ("denoising_1_4", "max_steps", (4, 6)), ("cnn", "max_epochs", (1, 2))],
+    ("method", "limit", "legs", "validated"),
+    [
+        ("nlt_photons", "max_steps", (4, 8, 10), 1),
+        ("denoising_1_4", "max_steps", (4, 6), 1),
+        ("cnn", "max_epochs", (1, 2), 1),
+        ("cnn", "max_steps", (4, 8, 10), 2),
+    ],
 )
-def test_resuming_is_exact(tiny, method, limit, legs):
-    """In one go or killed after an epoch, and again: the same parameters and optimiser to the bit."""
+def test_resuming_is_exact(tiny, method, limit, legs, validated):
+    """In one go or killed after an epoch, validated or not, and again: parameters and optimiser the same to the bit."""
 
     def run(length, *more):
-        limits = {"max_steps": -1, "max_epochs": -1, limit: length}
+        limits = {"max_steps": -1, "max_epochs": -1, "check_val_every_n_epoch": validated, limit: length}
         trainer = run_lightning(
             tiny.command("fit", method, *(f"--trainer.{name}={value}" for name, value in limits.items()), *more)
         ).trainer
