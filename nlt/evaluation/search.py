@@ -36,8 +36,9 @@ SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
 _ETA, _RUNGS = 3, 3  # one in three goes on, at most so often
 _LEAST = 3  # candidates in the last rung
 _ENOUGH = 6  # candidates: below these, rather fewer steps
-_TIMING = 0.1  # of the budget, at most, for the times per frame
-_SETUP = 3.0  # seconds a training takes beside its steps, before that has been measured
+_TIMING = 0.1  # of the budget, at most, for the times per step, and as much for those per frame
+_SETUP = 3.0  # seconds a training takes beside its steps, about
+_RECENT = 5  # trainings, by which the estimates are corrected
 _BATCH = 16
 
 now = time.perf_counter
@@ -70,7 +71,7 @@ class Search:
         self.spent = 0.0
         self.entries: dict[Candidate, Entry] = {}
         self.seeds = [0]
-        self._overheads: list[float] = []
+        self._ratios: list[float] = []  # of the time that trainings took, to what was estimated before the first
         trainer = ladder.config(ladder.full)
         self._most, batch_size = trainer["trainer"]["max_steps"], trainer["data"].get("batch_size", 32)
         self._epoch = max(1, len(ladder.spec.scenes) * ladder.spec.train // batch_size)
@@ -91,31 +92,32 @@ class Search:
         self.rungs, self.spent = plan["rungs"], plan["spent_s"]
         costs = dict(zip(self.ladder.candidates, plan["costs"], strict=False))
         self.entries = {candidate: Entry(candidate, cost) for candidate, cost in costs.items()}
-        counts = self._counts(self.rungs)
+        order = list(self.entries)
+        fit = max((n for n in range(2, len(order) + 1) if self._fits(order, n, self.rungs)), default=2)
+        counts = zip(self._counts(self.rungs, fit), self.rungs, strict=True)
         print(
-            f"{len(self.entries)} of {len(self.ladder.candidates)} candidates fit into {self.ladder.minutes:g} min: "
-            + ", ".join(f"{n} for {steps} steps" for n, steps in zip(counts, self.rungs, strict=True))
+            f"{fit} of {len(self.ladder.candidates)} candidates fit into {self.ladder.minutes:g} min: "
+            + ", ".join(f"{n} for {steps} steps" for n, steps in counts)
             + (f", the last with {self.ladder.seeds} seeds" if self.ladder.seeds > 1 else "")
-            + f"; about {(self.spent + self._cost(self._dearest(), self.rungs)) / 60:.1f} min in all",
+            + f"; about {(self.spent + self._cost(order[:fit], self.rungs)) / 60:.1f} min in all",
             flush=True,
         )
 
     def _plan(self) -> dict[str, Any]:
-        """Step times, in the ladder's order, until no more fit; then times per frame, all taking turns."""
+        """The steps of the rungs, and what every candidate costs: per step, and per frame with all taking turns."""
         begin, rungs = now(), self._steps(self._most)
         modules: dict[Candidate, RenderingModule] = {}
-        needed = lambda: (self._cost(self._dearest(), rungs) + now() - begin) / (1 - _TIMING)
         for candidate in self.ladder.candidates:
+            if now() - begin > _TIMING * self.budget and len(modules) >= 2:
+                break
             modules[candidate] = self.ladder.build(candidate)
             self.entries[candidate] = Entry(candidate, {"step_s": self._step_s(modules[candidate])})
-            while needed() > self.budget and len(self.entries) <= _ENOUGH and rungs[-1] > self._epoch:
-                rungs = self._steps(max(rungs[-1] // 2, self._epoch))
-            if needed() > self.budget:
-                if len(self.entries) > 2:
-                    self.entries.popitem()
-                break
-        if needed() > self.budget or len(self.entries) < 2:
-            minutes = math.ceil(2 * needed() / 60)
+        order, enough = list(self.entries), min(_ENOUGH, len(self.entries))
+        self.spent = now() - begin + _TIMING * self.budget
+        while not self._fits(order, enough, rungs) and rungs[-1] > self._epoch:
+            rungs = self._steps(max(rungs[-1] // 2, self._epoch))
+        if not self._fits(order, 2, rungs):
+            minutes = math.ceil(2 * (self.spent + self._cost(order[:2], rungs)) / 60)
             raise UserError(f"--minutes: {self.ladder.minutes:g} are too few for two candidates; give {minutes}")
         clock = Clock(Frames(self._split("val")), self.device)
         laps = clock.race({c.slug: modules[c] for c in self.entries}, _TIMING * self.budget)
@@ -152,63 +154,74 @@ class Search:
             seconds.append(now() - begin)
         return min(seconds[1:])
 
-    def _counts(self, rungs: list[int]) -> list[int]:
-        """How many candidates are in each rung."""
-        count = len(self.entries)
-        return [max(math.ceil(count / _ETA**k), min(_LEAST, count)) for k in range(len(rungs))]
-
-    def _dearest(self) -> list[Candidate]:
-        return sorted(self.entries, key=lambda c: (c != self.ladder.full, -self.entries[c].cost["step_s"]))
+    def _counts(self, rungs: list[int], first: int) -> list[int]:
+        """How many candidates are in each rung, if so many are in the first."""
+        return [max(math.ceil(first / _ETA**k), min(_LEAST, first)) for k in range(len(rungs))]
 
     def _estimate(self, candidate: Candidate, steps: int) -> float:
-        overhead = statistics.median(self._overheads) if self._overheads else _SETUP
-        return overhead + steps * float(self.entries[candidate].cost["step_s"])
+        """Seconds: as was measured before, corrected by what trainings took of late."""
+        return self._nominal(candidate, steps) * (statistics.median(self._ratios[-_RECENT:]) if self._ratios else 1.0)
+
+    def _nominal(self, candidate: Candidate, steps: int) -> float:
+        return _SETUP + steps * float(self.entries[candidate].cost["step_s"])
 
     def _cost(self, order: list[Candidate], rungs: list[int], done: int = 0) -> float:
-        """Seconds that the rungs from `done` on take, if the first of `order` go on each time; seeds included."""
-        counts, total = self._counts(rungs), 0.0
-        for k in range(done, len(rungs)):
-            steps = rungs[k] - (rungs[k - 1] if k else 0)
-            total += sum(self._estimate(c, steps) for c in order[: counts[k]])
-        return total + (self.ladder.seeds - 1) * sum(self._estimate(c, rungs[-1]) for c in order[: counts[-1]])
+        """Seconds that the rungs from `done` on take at most, with `order` in the first of them; seeds included."""
+        dearest = sorted(order, key=lambda c: (c != self.ladder.full, -self.entries[c].cost["step_s"]))
+        counts, total = self._counts(rungs[done:], len(order)), 0.0
+        for count, steps, begun in zip(counts, rungs[done:], [0, *rungs][done:], strict=False):
+            total += sum(self._estimate(c, steps - begun) for c in dearest[:count])
+        return total + (self.ladder.seeds - 1) * sum(self._estimate(c, rungs[-1]) for c in dearest[: counts[-1]])
+
+    def _fits(self, order: list[Candidate], first: int, rungs: list[int], trained: int = 0) -> bool:
+        """Whether the first of `order` fit into what is left of the budget; `trained` of them are through rung one."""
+        paid = sum(self._estimate(c, rungs[0]) for c in order[:trained])
+        return self.spent - paid + self._cost(order[:first], rungs) <= self.budget
 
     # --- the search ---
 
     def run(self) -> list[Candidate]:
         """Those that were trained longest, each with scores of all `seeds`: at the same number of steps."""
         self.plan()
-        counts, order, finals = self._counts(self.rungs), list(self.entries), list[Candidate]()
-        for k, steps in enumerate(self.rungs):
-            begun = self.rungs[k - 1] if k else 0
-            alive = []
-            for number, candidate in enumerate(order, 1):
-                estimate = self._estimate(candidate, steps - begun)
-                first = candidate == self.ladder.full and self.spent < self.budget
-                if self.spent + estimate > self.budget and not first:
-                    self.entries[candidate].status = f"no time left after {begun} steps"
-                    continue
-                if self.train(candidate, 0, steps, begun):
-                    alive.append(candidate)
-                left = (self.budget - self.spent) / 60
-                print(f"rung {k + 1} of {len(self.rungs)}, {number} of {len(order)}: {candidate.name}: {steps} steps; "
-                      f"{left:.1f} of {self.ladder.minutes:g} min left", flush=True)  # fmt: skip
-            if not alive:
-                break
-            finals = alive
-            order = self._order(alive)
-            if k + 1 < len(self.rungs):
-                keep = counts[k + 1]
-                while keep > 1 and self.spent + self._cost(order[:keep], self.rungs, k + 1) > self.budget:
-                    keep -= 1
-                for candidate in order[keep:]:
-                    self.entries[candidate].status = f"dropped after {steps} steps"
-                order = order[:keep]
+        finals = self._rung(0, list(self.entries))
         if not finals:
             raise UserError(f"{self.ladder.scale}: every candidate diverged; lower model.init_args.learning_rate")
+        counts = self._counts(self.rungs, len(finals))
+        for k in range(1, len(self.rungs)):
+            order, keep = self._order(finals), counts[k]
+            while keep > 1 and self.spent + self._cost(order[:keep], self.rungs, k) > self.budget:
+                keep -= 1
+            for candidate in order[keep:]:
+                self.entries[candidate].status = f"dropped after {self.rungs[k - 1]} steps"
+            finals = self._rung(k, order[:keep]) or finals
+        while (last := self.rungs[-1]) < self._most:  # less had been hoped for than there was time
+            rungs = [*self.rungs, min(_ETA * last, self._most // self._epoch * self._epoch)]
+            if rungs[-1] == last or self.spent + self._cost(finals, rungs, len(self.rungs)) > self.budget:
+                break
+            self.rungs = rungs
+            finals = self._rung(len(rungs) - 1, self._order(finals)) or finals
         finals = self._more_seeds(finals)
         for candidate in finals:
             self.entries[candidate].status = "trained to the end"
         return finals
+
+    def _rung(self, k: int, order: list[Candidate]) -> list[Candidate]:
+        """Train candidates up to a rung, as long as there is time; those that did not diverge."""
+        steps, begun = self.rungs[k], self.rungs[k - 1] if k else 0
+        alive = []
+        for number, candidate in enumerate(order, 1):
+            late = self.spent + self._estimate(candidate, steps - begun) > self.budget
+            if k == 0 and number > 2:  # room for the rungs that follow, too
+                late = not self._fits(order, number, self.rungs, number - 1)
+            if late and (candidate != self.ladder.full or self.spent >= self.budget):
+                self.entries[candidate].status = f"no time left after {begun} steps"
+                continue
+            if self.train(candidate, 0, steps, begun):
+                alive.append(candidate)
+            left = (self.budget - self.spent) / 60
+            print(f"rung {k + 1} of {len(self.rungs)}, {number} of {len(order)}: {candidate.name}: {steps} steps; "
+                  f"{left:.1f} of {self.ladder.minutes:g} min left", flush=True)  # fmt: skip
+        return alive
 
     def _more_seeds(self, finals: list[Candidate]) -> list[Candidate]:
         """Train them with further seeds, as long as there is time for all; those that did not diverge."""
@@ -252,7 +265,7 @@ class Search:
         if "diverged" in content:
             entry.status = "diverged"
             return False
-        self._overheads.append(max(0.0, content["seconds"] - (steps - begun) * entry.cost["step_s"]))
+        self._ratios.append(content["seconds"] / self._nominal(candidate, steps - begun))
         entry.steps = steps
         return True
 
@@ -262,17 +275,13 @@ class Search:
 
     def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
         """Train up to `steps`; how many of them were done now."""
-        # By epochs: going on after max_steps, Lightning trains on a batch of the epoch before once more.
-        limit = {"max_steps": -1, "max_epochs": steps // self._epoch}
-        if steps < self._epoch:
-            limit = {"max_steps": steps}
         logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
         own = {
             "seed_everything": seed,
             "model": {"init_args": {"seed": seed}},
             "data": {"seed": seed},
             "trainer": {
-                **limit, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
+                "max_steps": steps, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
                 "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
             },
         }  # fmt: skip

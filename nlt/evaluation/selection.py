@@ -47,14 +47,15 @@ def markdown(name: str, rows: Sequence[Row], confirmed: Sequence[Row], record: M
               "best:", ""]  # fmt: skip
     lines += [_line(["candidate", "steps", *(heading(key) for key in (*_COSTS, *_SCORES)), ""])]
     lines += [_line(["---", *["---:"] * (1 + len(_COSTS) + len(_SCORES)), "---"])]
-    for row in sorted(rows, key=lambda row: (-row.get("steps", -1), row.get("time_per_frame_s", math.inf))):
+    tried, rest = [row for row in rows if row.get("steps")], [row for row in rows if not row.get("steps")]
+    for row in sorted(tried, key=lambda row: (-row.get("steps", -1), row.get("time_per_frame_s", math.inf))):
         cells = [row["candidate"], row.get("steps", "–"), *(text(key, row.get(key)) for key in _COSTS)]
         status = ", ".join([row["status"], *(role for role in ("chosen", "full") if row[role])])
         lines.append(_line([*cells, *(_score(row, key, "behind") for key in _SCORES), status]))
-    return (
-        "\n".join([*lines, "", "Where the numbers come from: manifest.json, table.csv, confirmed.csv, views.csv."])
-        + "\n"
-    )
+    if rest:
+        lines += ["", f"Not tried, for want of time: {'; '.join(row['candidate'] for row in rest)}."]
+    lines += ["", "Where the numbers come from: manifest.json, table.csv, confirmed.csv, views.csv.", ""]
+    return "\n".join(lines)
 
 
 def claims(chosen: Row, full: Row) -> list[tuple[str, str]]:
@@ -106,6 +107,7 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
     methods = list(dict.fromkeys(row["method"] for row in rows))[::-1]
     scored = [row for row in rows if _SCORES[0] in row]
     for axis, key in zip(axes, _SCORES, strict=True):
+        labelled = 0
         for k, method in enumerate(methods):
             style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "ls": ""}
             for row in (row for row in scored if row["method"] == method):
@@ -121,7 +123,9 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
                                       weight="bold", color=colour, path_effects=_HALO, zorder=5)  # fmt: skip
                 if final:
                     what = row["candidate"].partition("@")[2].replace(" points", "").replace(" photons", "")
-                    axis.annotate(what, at, (0, -18), textcoords="offset points", ha="center", fontsize=6,
+                    labelled += 1
+                    below = (0, -18 - 9 * (labelled % 2))
+                    axis.annotate(what, at, below, textcoords="offset points", ha="center", fontsize=6,
                                   path_effects=_HALO, zorder=5)  # fmt: skip
             axis.plot([], [], label=label(method), **style)
         axis.set_xscale("log")
@@ -133,7 +137,7 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
         axis.set_xlabel("time per frame (ms)")
         axis.set_title(f"{heading(key)}, validation split", fontsize=10)
         axis.grid(alpha=0.3, which="both")
-        axis.margins(0.1, 0.15)
+        axis.margins(0.15, 0.15)
     steps = sorted({row["steps"] for row in scored})
     title = f"filled: {steps[-1]} steps, with size, points and photons; faint: dropped before"
     figure.suptitle(title, fontsize=9)
