@@ -477,7 +477,7 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
     ("scale", "data", "name"),
     [
         (None, None, "table2"),
-        ("small", "real/living_room_moving_lights", "table2"),
+        ("small", "real/dynamic_moving_lights", "table2"),
         ("demo", None, "table2-demo"),
         ("demo", "real/static_egg", "table2-demo-real-static_egg"),
         ("there/large.yaml", None, "table2-large"),
