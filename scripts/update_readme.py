@@ -1,9 +1,27 @@
-"""Copies the tables that the README shows out of results/: `python scripts/update_readme.py`."""
+"""Copies what the documentation shows out of results/ and the code: `python scripts/update_readme.py`.
+
+A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
+(`results/NAME/table.md`), a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
+"""
 
 import re
+import runpy
 from pathlib import Path
 
+from nlt.data import sample
+
 PROJECT = Path(__file__).resolve().parents[1]
+PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+
+
+def content(source: str) -> str:
+    """What belongs into a block."""
+    path, _, name = source.partition(" ")
+    if path == "nlt/data/sample.py":
+        return field_table(getattr(sample, name))
+    if path == "scripts/paper_scale.py":
+        return str(runpy.run_path(str(PROJECT / path))["tables"](PROJECT / "results/bench/target"))
+    return first_table(PROJECT / path)
 
 
 def first_table(path: Path) -> str:
@@ -14,12 +32,21 @@ def first_table(path: Path) -> str:
     return "\n".join(lines[start:stop])
 
 
+def field_table(fields: dict[str, sample.Field]) -> str:
+    """A row per field of a sample."""
+    rows = ["| field | shape | dtype | unit | meaning |", "|---|---|---|---|---|"]
+    for name, f in fields.items():
+        star, shape = " *" * f.reference_only, ", ".join(map(str, f.shape))
+        rows.append(f"| `{name}`{star} | ({shape}) | {f.dtype} | {f.unit} | {f.meaning} |")
+    return "\n".join(rows)
+
+
 def update(text: str) -> str:
-    """The text with every block between `<!-- results/.../table.md -->` and `<!-- end -->` made anew."""
-    block = re.compile(r"<!-- (results/\S+/table\.md) -->\n.*?\n<!-- end -->", re.DOTALL)
-    return block.sub(lambda m: f"<!-- {m[1]} -->\n{first_table(PROJECT / m[1])}\n<!-- end -->", text)
+    """The text with every block made anew."""
+    block = re.compile(r"<!-- (results/\S+/table\.md|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
+    return block.sub(lambda m: f"<!-- {m[1]} -->\n{content(m[1])}\n<!-- end -->", text)
 
 
 if __name__ == "__main__":
-    readme = PROJECT / "README.md"
-    readme.write_text(update(readme.read_text()))
+    for page in PAGES:
+        page.write_text(update(page.read_text()))
