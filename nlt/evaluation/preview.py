@@ -13,7 +13,7 @@ from nlt.metrics.display import display
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.scenes.assembly import Scene
-from nlt.scenes.description import load_description
+from nlt.scenes.description import SceneDescription, load_description
 from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
@@ -41,7 +41,7 @@ def contact_sheet(
     choose_variant()  # once; the processes inherit it
     # A process per scene: Mitsuba's memory grows with every one.
     for row, (name, description) in enumerate(zip(names, descriptions, strict=True)):
-        images = Process(_images, name, views, resolution, spp, experiment, seed).result()
+        images = Process(_images, description, views, resolution, spp, experiment, seed).result()
         title = f"{name} ({experiment.replace('_', ' ')}, exposure {description.exposure:g}, {spp} spp)"
         draw.text((_GAP, row * height + _GAP), title, "black", font_size=14)
         for column, image in enumerate(images):
@@ -51,10 +51,11 @@ def contact_sheet(
     sheet.save(output, optimize=True, quality=90)  # of a JPEG; noise makes a PNG five times as large
 
 
-def _images(name: str, views: int, resolution: int, spp: int, experiment: str, seed: int) -> list[np.ndarray]:
+def _images(
+    description: SceneDescription, views: int, resolution: int, spp: int, experiment: str, seed: int
+) -> list[np.ndarray]:
     """(H, W, 3) uint8 sRGB images of one scene."""
     use_variant()
-    description = load_description(name)
     scene = Scene(description, experiment)
     renderer, sampler = Renderer(scene), Views(scene)
     images = []
