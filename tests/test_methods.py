@@ -140,6 +140,16 @@ def test_splitting_the_photons(name):
     torch.testing.assert_close(method(batch), expected)
 
 
+def test_the_papers_optimiser():
+    """Sec. 3, Implementation Details: the defaults, with which scale `paper` trains."""
+    (optimiser,), (schedule,) = CNN(width=1).configure_optimizers()
+    assert type(optimiser) is torch.optim.Adam and optimiser.param_groups[0]["lr"] == 5e-4
+    optimiser.step()
+    schedule.step()  # after an epoch, as Lightning does by default
+    assert optimiser.param_groups[0]["lr"] == pytest.approx(0.99 * 5e-4, rel=1e-12)
+    assert CNN(width=1).loss is losses.mse
+
+
 @pytest.mark.parametrize("number", range(1, 16))
 def test_ablation_of_inputs(number):
     """Any combination: only what is chosen reaches the U-Net, and none of the rest is needed."""

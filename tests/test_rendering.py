@@ -493,7 +493,7 @@ def gradients(network, inputs, targets):
 
 
 def test_lemma(renderer, demo):
-    """Eq. 2: noisy targets give the gradient of the noise-free image in expectation; clamped ones do not."""
+    """Eq. 3: noisy targets give the gradient of the noise-free image in expectation; clamped ones do not."""
     renderer.scene.set_state(away("moving_lights", demo))
     camera = sample_view(demo, 16, np.random.default_rng(9))
     inputs = torch.from_numpy(np.concatenate(list(renderer.gbuffer(camera).values()))[None].astype(float))
