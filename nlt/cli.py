@@ -6,17 +6,21 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from nlt import __version__
 from nlt.errors import UserError, as_mistake
 
 _LIGHTNING = {
-    "fit": "train a method",
-    "validate": "validation metrics of a checkpoint",
-    "test": "all metrics of a checkpoint on the test split",
-    "predict": "images of a checkpoint for the test split",
+    "fit": "train one method, of configs of data, model and scale",
+    "validate": "compute the validation metrics of a checkpoint, of the same configs",
+    "test": "compute all metrics of a checkpoint on the test split",
+    "predict": "write a checkpoint's images of the test split",
 }
+
+# Words of several commands' help.
+_OUT, _IMAGE = "directory of the results (default: {})", "image to write (default: {})"
+_VIEWS, _SIDE = "random views of each scene", "height and width of an image"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +39,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+class _Commands(argparse._SubParsersAction):
+    def add_parser(self, name: str, *, help: str, **options: Any) -> Any:  # type: ignore[override]
+        """A command's own help begins with what the list of commands says of it."""
+        return super().add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", **options)
+
+
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.register("action", "parsers", _Commands)
+
     def error(self, message: str) -> NoReturn:
         """One line for a mistake here as everywhere."""
         raise UserError(f"{message}; see {self.prog} --help")
@@ -138,123 +152,143 @@ def _scenes(options: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="nlt", description="Learned light transport: data, training, comparison.")
+    parser = _Parser(
+        prog="nlt", description="Learned light transport: which renderer for this scene and this time budget?",
+        epilog="`nlt compare --config demo` shows all of it in minutes; more in docs/commands.md.",
+    )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"nlt {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    generate = commands.add_parser("generate", help="render a dataset; resumes, and does nothing if it is complete")
-    generate.add_argument("--config", action="append", required=True, help="YAML; later ones override earlier ones")
-    _add_scheduler(generate, "jobs side by side (default: a core each; as a cluster has threads; in a Slurm array, 64)")
-    data = commands.add_parser("data", help="look at a dataset: show, verify, stats")
+    generate = commands.add_parser("generate", help="render a dataset, or what is missing of it")
+    generate.add_argument(
+        "--config", action="append", required=True, help="a YAML file; later ones override earlier ones"
+    )
+    _add_scheduler(generate, "jobs side by side (default: as many as cores; on Dask, as threads; in a Slurm array, 64)")
+    data = commands.add_parser("data", help="show, verify or measure a dataset")
     _add_data(data)
     for name, text in _LIGHTNING.items():
         # Handed to Lightning's own parser before this one sees it; here for the help.
-        commands.add_parser(name, help=f"{text}: --config data --config model --config scale; see nlt {name} --help")
-    compare = commands.add_parser("compare", help="a table of all methods: generates, trains, evaluates, times")
-    stress = commands.add_parser("stress", help="where a comparison's methods break: suites of growing severity")
+        commands.add_parser(name, help=text)
+    compare = commands.add_parser("compare", help="make a table of methods: generate, train, evaluate, time, draw")
+    stress = commands.add_parser("stress", help="find where a comparison's methods break: suites of growing severity")
     for command in (compare, stress):
-        command.add_argument("--config", required=True, help="a config of configs/compare, by name or path")
-        command.add_argument("--out", help="where the results go (default: results/NAME, or NAME-SCALE-DATA if given)")
-        command.add_argument("--scale", help="another scale than the config's: a name in configs/scale, or a path")
-        command.add_argument("--data", help="another dataset than the config's: a name in configs/data, or a path")
-        command.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
-    stress.add_argument("--suites", nargs="+", type=_suite, help="only these suites (default: all)")
-    stress.add_argument("--manifest", default="suites", help="of the suites: a name in configs/stress, or a path")
+        command.add_argument("--config", required=True, help="a comparison of configs/compare, by name or path")
+        command.add_argument("--out", help="directory of the results (default: results/NAME, or NAME-SCALE-DATA)")
+        command.add_argument("--scale", help="of configs/scale, by name or path (default: the comparison's)")
+        command.add_argument("--data", help="of configs/data, by name or path (default: the comparison's)")
+        command.add_argument("--methods", nargs="+", help="of configs/model (default: the comparison's, else all)")
+    stress.add_argument("--suites", nargs="+", type=_suite, help="of the manifest (default: all)")
+    stress.add_argument("--manifest", default="suites", help="of configs/stress, by name or path (default: suites)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
     compare.add_argument(
         "--train-images", nargs="+", type=_positive, default=[], metavar="N",
-        help="train every method on the first N images of each scene, too: for the learning curves",
+        help="also train every method on the first N images of each scene, for the learning curves",
     )  # fmt: skip
-    _add_scheduler(compare, "trainings side by side (default: in turn; on a cluster as `nlt generate`)")
+    _add_scheduler(compare, "trainings side by side (default: one; on a cluster as nlt generate)")
     compare.add_argument(
         "--precision", choices=("auto", "32", "bf16"), default="auto",
-        help="in which methods are trained, judged and timed (default: auto, bf16 where the device multiplies it)",
+        help="of what is trained, judged and timed (default: auto, bf16 where the device multiplies it)",
     )  # fmt: skip
-    _add_bench(commands.add_parser("bench", help="what a frame, a training step and a sample cost, stage by stage"))
-    export = commands.add_parser("export", help="a trained network as one file that runs with PyTorch alone")
-    export.add_argument("checkpoint", help="of nlt fit")
-    export.add_argument("-o", "--output", required=True, help="the torch.export program, such as nlt.pt2")
-    export.add_argument("--resolution", type=_positive, default=256, help="of its images (default: 256)")
-    export.add_argument("--photons", type=_positive, default=10000, help="that it is given (default: 10000)")
-    select = commands.add_parser("select", help="the smallest model that a scene needs: what varies, what measures say")
-    select.add_argument("--config", required=True, help="a config of configs/select, by name or path")
-    select.add_argument("--minutes", type=float, help="to measure and train in (default: the config's)")
-    select.add_argument("--out", help="where the results go (default: results/select/NAME)")
-    select.add_argument("--advice", action="store_true", help="only say what varies; train nothing")
+    _add_bench(commands.add_parser("bench", help="measure what a frame, a training step and a sample cost"))
+    export = commands.add_parser("export", help="write a trained network as one file that runs with PyTorch alone")
+    export.add_argument("checkpoint", metavar="CKPT", help="a checkpoint of nlt fit")
+    export.add_argument("-o", "--output", required=True, help="file of the torch.export program, such as nlt.pt2")
+    export.add_argument(
+        "--resolution", type=_positive, default=256, help="height and width of its images (default: 256)"
+    )
+    export.add_argument("--photons", type=_positive, default=10000, help="how many it is given (default: 10000)")
+    select = commands.add_parser("select", help="find the smallest model that a scene needs, within minutes")
+    select.add_argument("--config", required=True, help="a ladder of configs/select, by name or path")
+    select.add_argument("--minutes", type=float, help="to measure and train in (default: the ladder's)")
+    select.add_argument("--out", help="directory of the results (default: results/select/NAME)")
+    select.add_argument(
+        "--advice", action="store_true", help="only say what varies in the scene, and so what is needed; train nothing"
+    )
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
-    board.add_argument("--port", type=int, default=6006, help="(default: 6006; 0 takes a free one)")
+    board.add_argument("--port", type=int, default=6006, help="of the server (default: 6006; 0 takes a free one)")
     for command in (report, board):
-        command.add_argument("directory", help="of the results, as `nlt compare` wrote them")
-    teachers = commands.add_parser("teachers", help="path against bdpt: variance at equal time, scene by scene")
-    teachers.add_argument("names", nargs="+", help="descriptions of scenes, by name or path")
-    teachers.add_argument("--out", type=Path, default=Path("results/teachers"))
-    for option, default in (("--seconds", 60), ("--resolution", 64), ("--views", 4)):
-        teachers.add_argument(option, type=_positive, default=default)
-    teachers.add_argument("--experiment", type=_experiment, default="fixed_lights")
-    teachers.add_argument("--seed", type=int, default=0)
-    _add_scenes(commands.add_parser("scenes", help="scenes: list, show, check, preview, add"))
+        command.add_argument("directory", help="of results, as nlt compare wrote them")
+    teachers = commands.add_parser("teachers", help="compare path and bdpt: variance at equal time, scene by scene")
+    _add_views(teachers, seconds=(60, "of rendering by each teacher"), resolution=(64, _SIDE), views=(4, _VIEWS))
+    teachers.add_argument("--out", type=Path, default=Path("results/teachers"), help=_OUT.format("results/teachers"))
+    _add_scenes(commands.add_parser("scenes", help="list, show, check, add or preview scenes"))
     return parser
+
+
+def _add_views(parser: argparse.ArgumentParser, **numbers: tuple[int, str]) -> None:
+    """Scenes, and what of them is rendered."""
+    parser.add_argument("names", nargs="+", help="descriptions of configs/scenes, by name or path")
+    for name, (default, text) in numbers.items():
+        parser.add_argument(f"--{name}", type=_positive, default=default, help=f"{text} (default: {default})")
+    parser.add_argument(
+        "--experiment", type=_experiment, default="fixed_lights",
+        help="static, fixed_lights or moving_lights (default: fixed_lights)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of states, views and noise (default: 0)")
 
 
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
     parser.add_argument("--workers", type=_positive, help=workers)
     parser.add_argument(
-        "--scheduler", default="local", help="local, slurm, or a Dask scheduler such as tcp://host:8786"
+        "--scheduler",
+        default="local",
+        help="local, slurm, or a Dask scheduler such as tcp://host:8786 (default: local)",
     )
     parser.add_argument(
-        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE", help="such as partition=gpu, time=60"
+        "--slurm",
+        action="append",
+        type=_pair,
+        default=[],
+        metavar="KEY=VALUE",
+        help="an option of sbatch, such as time=60",
     )
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", default="demo", help="a config of configs/data, by name or path (default: demo)")
-    parser.add_argument("--scale", default="demo", help="a config of configs/scale (default: demo)")
-    parser.add_argument("--methods", nargs="+", help="only these methods (default: every file in configs/model)")
+    parser.add_argument("--data", default="demo", help="of configs/data, by name or path (default: demo)")
+    parser.add_argument("--scale", default="demo", help="of configs/scale, by name or path (default: demo)")
+    parser.add_argument("--methods", nargs="+", help="of configs/model (default: all)")
     parser.add_argument(
         "--set", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
-        help="resolution, points, photons, width, depth, batch_size, workers of the configs; batch: frames at once",
+        help="over the configs: resolution, points, photons, width, depth, batch_size, workers; batch: frames at once",
     )  # fmt: skip
-    parser.add_argument("--ckpt", help="weights of the one method (default: random ones)")
+    parser.add_argument("--ckpt", help="a checkpoint of the one method (default: random weights)")
     parser.add_argument("--device", help="cpu or cuda (default: cuda, if there is one)")
-    parser.add_argument("--seconds", type=_positive, default=20, help="that a measurement may take (default: 20)")
+    parser.add_argument("--seconds", type=_positive, default=20, help="the most that a measurement takes (default: 20)")
     parser.add_argument(
         "--growth", nargs="*", metavar="METHOD",
-        help="cost over resolution, points, photons, width and batch (default: none; without a name, of nlt_photons)",
+        help="also measure over resolution, points, photons, width and batch (without a name: nlt_photons)",
     )  # fmt: skip
-    parser.add_argument("--out", default="results/bench", help="where the results go (default: results/bench)")
+    parser.add_argument("--out", default="results/bench", help=_OUT.format("results/bench"))
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
-    actions.add_parser("list", help="the descriptions of configs/scenes")
-    show = actions.add_parser("show", help="a description in words, and what its scene has")
-    show.add_argument("name", help="of a description, or the path of one")
-    check = actions.add_parser("check", help="load a scene file; what it has, what it lacks, what to make of it")
-    add = actions.add_parser("add", help="write a description of a scene file, to edit")
+    actions.add_parser("list", help="list the descriptions of configs/scenes")
+    show = actions.add_parser("show", help="say what a description and its scene hold")
+    show.add_argument("name", help="of a description of configs/scenes, or a path")
+    check = actions.add_parser("check", help="load a scene file; say what it has, what it lacks, what to make of it")
+    add = actions.add_parser("add", help="measure a scene file and write a description of it, to edit")
     for action in (check, add):
         action.add_argument("file", type=Path, help="Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ")
     add.add_argument("--name", help="of the scene (default: the file's, or its folder's for scene.xml)")
-    add.add_argument("-o", "--output", type=Path, help="where to (default: configs/scenes/NAME.yaml)")
-    preview = actions.add_parser("preview", help="a contact sheet: a row per scene, random views of random states")
-    preview.add_argument("names", nargs="+", help="descriptions, by name or path")
-    preview.add_argument("-o", "--output", type=Path, default=Path("preview.png"))
-    for option, default in (("--views", 4), ("--resolution", 256), ("--spp", 64)):
-        preview.add_argument(option, type=_positive, default=default)
-    preview.add_argument("--experiment", type=_experiment, default="fixed_lights")
-    preview.add_argument("--seed", type=int, default=0)
+    add.add_argument("-o", "--output", type=Path, help="file to write (default: configs/scenes/NAME.yaml)")
+    preview = actions.add_parser("preview", help="draw a contact sheet: a row per scene, random views of random states")
+    preview.add_argument("-o", "--output", type=Path, default=Path("preview.png"), help=_IMAGE.format("preview.png"))
+    _add_views(preview, views=(4, _VIEWS), resolution=(256, _SIDE), spp=(64, "samples per pixel"))
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
-    show = actions.add_parser("show", help="draw the components of a sample")
-    show.add_argument("--split", choices=("val", "test"), default="test")
-    show.add_argument("--index", type=int, default=0)
-    show.add_argument("-o", "--output", default="sample.png")
+    show = actions.add_parser("show", help="draw the twelve components of a sample")
+    show.add_argument("--split", choices=("val", "test"), default="test", help="of the sample (default: test)")
+    show.add_argument("--index", type=int, default=0, help="of the sample in its split (default: 0)")
+    show.add_argument("-o", "--output", default="sample.png", help=_IMAGE.format("sample.png"))
     verify = actions.add_parser("verify", help="read every byte and say all that is wrong")
-    stats = actions.add_parser("stats", help="bytes and seconds by field, here and for the paper's full dataset")
-    stats.add_argument("--workers", type=_positive, help="side by side (default: as many as cores)")
+    stats = actions.add_parser("stats", help="measure bytes and seconds by field, here and at the paper's scale")
+    stats.add_argument("--workers", type=_positive, help="processes side by side (default: as many as cores)")
     for action in (show, verify, stats):
-        action.add_argument("dataset", help="directory or URL of a dataset, as `nlt generate` prints it")
+        action.add_argument("dataset", help="directory or URL, as nlt generate prints it")
 
 
 def _run_data(options: argparse.Namespace) -> None:

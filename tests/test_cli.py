@@ -11,7 +11,7 @@ import yaml
 from conftest import write_room, write_yaml
 from tiny import DATASET, SCALE, copy_dataset, write
 
-from nlt.cli import main
+from nlt.cli import _parser, main
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.spec import DATA, merge
@@ -47,7 +47,7 @@ def refused(capfd):
 def test_help_imports_nothing_heavy():
     code = """if True:
         import sys
-        from nlt.cli import main
+        from nlt.cli import _parser, main
         try:
             main(["--help"])
         except SystemExit as done:
@@ -59,6 +59,20 @@ def test_help_imports_nothing_heavy():
     modules = set(done.stderr.split())
     assert "nlt.cli" in modules
     assert not modules & {"torch", "mitsuba", "drjit", "lightning", "numpy", "jsonargparse", "matplotlib", "yaml"}
+
+
+def test_every_word_of_help():
+    """Every command says what it does, as the list of commands does; every argument what it is."""
+
+    def look(parser, path):
+        for action in parser._actions:
+            assert action.help or hasattr(action, "_choices_actions"), (path, action.dest)
+            for choice in getattr(action, "_choices_actions", ()):
+                command = action.choices[choice.dest]
+                assert command.description.lower() == f"{choice.help.lower()}." and choice.help[0].islower()
+                look(command, f"{path} {choice.dest}")
+
+    look(_parser(), "nlt")
 
 
 def test_help_of_fit(capfd):
