@@ -2,9 +2,14 @@
 
 import re
 import runpy
+import tomllib
 
 import pytest
+import yaml
 
+from nlt import __version__
+from nlt.data.spec import FORMAT, DatasetSpec
+from nlt.data.store import points_name
 from nlt.paths import PROJECT
 
 PAGES = [*sorted(PROJECT.glob("*.md")), *sorted((PROJECT / "docs").glob("*.md"))]
@@ -42,3 +47,21 @@ def test_copies_are_as_they_stand():
     assert script["update"](copied) == copied
     forged = copied.replace("first half of the reference", "a number of someone's")
     assert script["update"](forged) == copied != forged
+
+
+def test_files_of_a_dataset():
+    """docs/data-format.md: the format's number, the names of the files, the keys of the manifest."""
+    page, spec = (PROJECT / "docs/data-format.md").read_text(), DatasetSpec(["egg"], "static", train=1, val=1, test=1)
+    assert f"Format {FORMAT} " in page and points_name(0) in page
+    for shard in spec.shards():
+        assert shard.name in page or f"{shard.split}/..." in page
+    assert all(f"`{key}`" in page for key in (*spec.manifest, "variant"))
+
+
+def test_citation_and_licence():
+    """CITATION.cff has what its format requires, and says the same as the package."""
+    cited = yaml.safe_load((PROJECT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(cited)
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    assert cited["version"] == project["version"] == __version__
+    assert cited["license"] == project["license"] == (PROJECT / "LICENSE").read_text().split()[0]
