@@ -32,6 +32,8 @@ from nlt.evaluation import clock, compare, comparison, learning_curves, progress
 from nlt.evaluation.dashboard import write_logs
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.gallery import Shown, worst_pixels
+from nlt.evaluation.judge import Evaluation
+from nlt.evaluation.provenance import origin
 from nlt.evaluation.report import draw
 from nlt.evaluation.results import load, write_images, write_rows
 from nlt.evaluation.trainings import Training, train
@@ -485,6 +487,25 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
 )
 def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
     assert comparison.Comparison.load("table2", scale, data, None).name == name
+
+
+def test_what_is_judged_is_kept(world, monkeypatch):
+    """For the same commit, so that a killed comparison goes on; times are taken anew."""
+    for kept in world.folder.glob("runs/**/judged.npz"):
+        kept.unlink()
+    judged, original = [], Evaluation.evaluate
+    monkeypatch.setattr(Evaluation, "evaluate", lambda self, method: (judged.append(method), original(self, method))[1])
+
+    def judge(commit, changes=False):
+        judged.clear()
+        monkeypatch.setattr(compare, "origin", lambda: {**origin(), "commit": commit, "uncommitted_changes": changes})
+        world.compare("--methods", "cnn", "path_tracing_1", out="kept")
+        files = [world.folder / "kept" / name for name in ("views.csv", "images/cnn.npz")]
+        return len(judged), [file.read_bytes() for file in files], world.runs("kept")["cnn"]["synthesis_s"]
+
+    first, again = judge("one"), judge("one")
+    assert (first[0], again[0]) == (2, 0) and first[1] == again[1] and first[2] != again[2]
+    assert [judge("one", changes=True)[0], judge("two")[0]] == [2, 2]
 
 
 def test_history(world, more_methods):

@@ -99,16 +99,20 @@ def compare(
         "shown": test.shown,
         "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
     }
+    # What decides a judgement; by code that has no name none is kept.
+    key = {name: record[name] for name in ("commit", "versions", "device", "policy", "inception_weights")}
+    of = None if begun["uncommitted_changes"] else key
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
     for number, (method, seed) in enumerate(jobs, 1):
         print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed}
         with _noted(run):
-            module, took = untrained(method), dict[str, Any]()
+            module, took, place = untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
             if module is None:
-                module, took = _trained(trainings[method, seed, None], died, device)
-            metrics, each, radiance = test.evaluate(module)
+                training = trainings[method, seed, None]
+                (module, took), place = _trained(training, died, device), training.run
+            metrics, each, radiance = test.evaluate_once(module, place / "judged.npz", of and of | took)
             run |= clock.time(module) | metrics | clock.size(module) | took
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
             run["spp"] = (module.spp or spec.input_spp) if "path_tracing" in module.stages else 0
@@ -132,7 +136,8 @@ def compare(
         if training.train_images:
             row = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
             with _noted(row):
-                row |= test.evaluate(_trained(training, died, device)[0])[0]
+                module, took = _trained(training, died, device)
+                row |= test.evaluate_once(module, training.run / "judged.npz", of and of | took)[0]
             rows.append(row)
             print(f"{training.name}: {row['status']} {row['message']}", flush=True)
     if rows:

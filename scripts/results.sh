@@ -1,0 +1,18 @@
+#!/bin/sh
+# The published results, the most important first: sh scripts/results.sh [SCALE] (small, gpu, paper).
+# It may be killed at any time, and given again goes on with what is missing; on a machine lent for half an hour:
+# timeout 30m sh scripts/results.sh gpu
+set -eu
+scale=${1:-small}
+mkdir -p runs/done
+publish() {
+    done="runs/done/$(echo "$*" | tr ' /' '--')-$scale"
+    [ -e "$done" ] || { nlt compare --scale "$scale" --workers "${WORKERS:-2}" "$@" && touch "$done"; }
+}
+publish --config table2 --seeds 3
+publish --config table1 --seeds 3
+publish --config ablation
+publish --config static_kitchen
+publish --config static_bathroom
+publish --config table2 --data dynamic_moving_lights
+publish --config table1 --data dynamic_fixed_lights
