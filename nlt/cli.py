@@ -80,6 +80,8 @@ def _run(arguments: list[str]) -> int:
         from nlt.evaluation.export import export
 
         export(options.checkpoint, options.output, options.resolution, options.photons)
+    elif options.command == "render":
+        _render(options)
     elif options.command == "bench":
         _bench(options)
     elif options.command == "select":
@@ -122,6 +124,27 @@ def _bench(options: argparse.Namespace) -> None:
         device=options.device,
         seconds=options.seconds,
         growth=["nlt_photons"] if options.growth == [] else options.growth,
+    )
+
+
+def _render(options: argparse.Namespace) -> None:
+    if options.demo == bool(options.checkpoint) or (options.checkpoint and not options.scene):
+        raise UserError("give CKPT and SCENE, or --demo alone; see nlt render --help")
+    from nlt.evaluation.render import DEMO, render
+
+    demo = options.demo
+    render(
+        checkpoint=str(DEMO) if demo else options.checkpoint,
+        scene=DEMO.stem if demo else options.scene,
+        output=options.output,
+        state=options.state,
+        light=options.light or ("turntable" if demo and options.state.isdecimal() else None),
+        camera_path=options.camera_path,
+        frames=options.frames,
+        resolution=options.resolution,
+        fps=options.fps,
+        spp=options.spp,
+        photons=options.photons,
     )
 
 
@@ -191,11 +214,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_bench(commands.add_parser("bench", help="measure what a frame, a training step and a sample cost"))
     export = commands.add_parser("export", help="write a trained network as one file that runs with PyTorch alone")
     export.add_argument("checkpoint", metavar="CKPT", help="a checkpoint of nlt fit")
-    export.add_argument("-o", "--output", required=True, help="file of the torch.export program, such as nlt.pt2")
+    export.add_argument(
+        "-o", "--output", required=True,
+        help="file of the torch.export program, such as nlt.pt2; NAME.safetensors: the weights, for nlt render",
+    )  # fmt: skip
     export.add_argument(
         "--resolution", type=_positive, default=256, help="height and width of its images (default: 256)"
     )
     export.add_argument("--photons", type=_positive, default=10000, help="how many it is given (default: 10000)")
+    _add_render(commands.add_parser("render", help="make a video of a scene by a trained method, beside path tracing"))
     select = commands.add_parser("select", help="find the smallest model that a scene needs, within minutes")
     select.add_argument("--config", required=True, help="a ladder of configs/select, by name or path")
     select.add_argument("--minutes", type=float, help="to measure and train in (default: the ladder's)")
@@ -262,6 +289,25 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", default="results/bench", help=_OUT.format("results/bench"))
 
 
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="of nlt fit, or NAME.safetensors of nlt export")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="a description of configs/scenes, by name or path")
+    parser.add_argument("--demo", action="store_true", help="take the model that comes with nlt, and move the light")
+    parser.add_argument("--state", default="0", help="the number of a random state, or a YAML file (default: 0)")
+    parser.add_argument("--light", choices=("turntable",), help="moves around (default: as --state says)")
+    parser.add_argument(
+        "--camera-path", default="turntable", help="turntable, or a YAML or JSON file of views (default: turntable)"
+    )
+    parser.add_argument("-o", "--output", default="video.mp4", help="NAME.mp4 or a folder (default: video.mp4)")
+    for option, default in (("--frames", 48), ("--fps", 24)):
+        parser.add_argument(option, type=_positive, default=default, help=f"(default: {default})")
+    parser.add_argument("--resolution", type=_size, default=(256, 256), help="N or WIDTHxHEIGHT (default: 256)")
+    parser.add_argument(
+        "--spp", type=_spp, help="of path tracing beside it; 0 for none (default: equal, what takes as long)"
+    )
+    parser.add_argument("--photons", type=_positive, help="to cast (default: as the method was trained with)")
+
+
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
     actions.add_parser("list", help="list the descriptions of configs/scenes")
@@ -311,6 +357,19 @@ def _pair(text: str) -> tuple[str, str]:
     if not (key and equals and value):
         raise argparse.ArgumentTypeError(f"must be KEY=VALUE, is {text!r}")
     return key, value
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    return _positive(width), _positive(height or width)
+
+
+def _spp(text: str) -> int | None:
+    if text == "equal":
+        return None
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be equal or a whole number of at least 0, is {text!r}")
+    return int(text)
 
 
 def _experiment(text: str) -> str:

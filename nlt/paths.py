@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
-CONFIGS = PROJECT / "configs"
+# An installed package has them within itself.
+CONFIGS = next(folder for folder in (PROJECT / "configs", Path(__file__).with_name("configs")) if folder.is_dir())
 
 
 def scenes_root() -> Path:

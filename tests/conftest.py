@@ -30,6 +30,25 @@ def cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture
+def refused(capfd):
+    """Runs a command that is to fail: exit code 2, and nothing on stderr but one line with these words."""
+
+    from nlt.cli import main
+
+    def run(arguments, *words):
+        capfd.readouterr()
+        assert main([str(argument) for argument in arguments]) == 2
+        error = capfd.readouterr().err
+        assert error.startswith("nlt: error: ") and error.endswith("\n") and error.count("\n") == 1, error
+        assert "Traceback" not in error
+        for word in words:
+            assert str(word) in error
+        return error
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory, variant):
     """The directory of a small generated dataset: `generated.spec_of()`."""

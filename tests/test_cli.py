@@ -27,23 +27,6 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["nlt", "fit", "--config=x.yaml"])
 
 
-@pytest.fixture
-def refused(capfd):
-    """Runs a command that is to fail: exit code 2, and nothing on stderr but one line with these words."""
-
-    def run(arguments, *words):
-        capfd.readouterr()
-        assert main([str(argument) for argument in arguments]) == 2
-        error = capfd.readouterr().err
-        assert error.startswith("nlt: error: ") and error.endswith("\n") and error.count("\n") == 1, error
-        assert "Traceback" not in error
-        for word in words:
-            assert str(word) in error
-        return error
-
-    return run
-
-
 def test_help_imports_nothing_heavy():
     code = """if True:
         import sys

@@ -112,7 +112,7 @@ class SceneDescription:
         return total.hexdigest()
 
 
-class _Section:
+class Section:
     """A mapping of the file that knows its name, for error messages, and which keys were asked for."""
 
     def __init__(self, file: Path, name: str, data: Any, known: tuple[str, ...]) -> None:
@@ -156,7 +156,7 @@ class _Section:
         return box
 
     def min_max(self, key: str) -> np.ndarray:
-        section = _Section(self.file, self.field(key), self.get(key), ("min", "max"))
+        section = Section(self.file, self.field(key), self.get(key), ("min", "max"))
         box = np.stack([section.numbers(end, (3,)) for end in ("min", "max")])
         if (box[0] > box[1]).any():
             raise UserError(f"{self.file}: {self.field(key)}: is empty: min is above max")
@@ -181,7 +181,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
         *("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "look_at", "room", "teacher"),
         *("objects", "moving_light"),
     )
-    top = _Section(file, "", data, keys)
+    top = Section(file, "", data, keys)
     scale = 1.0 / float(top.positive("units_per_metre", default=1.0))
     up = top.get("up", "y")
     if up not in UP:
@@ -201,14 +201,14 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     for key, value in named.items():
         if key in (MOVING_LIGHT, STATIC):
             raise UserError(f"{file}: objects.{key}: this name is taken; choose another name")
-        section = _Section(file, f"objects.{key}", value, ("shapes", "box"))
+        section = Section(file, f"objects.{key}", value, ("shapes", "box"))
         shapes = section.get("shapes")
         if not isinstance(shapes, list) or not shapes:
             raise UserError(f"{file}: objects.{key}.shapes: must be a list of shape ids, is {shapes!r}")
         objects.append(Movable(str(key), tuple(map(str, shapes)), section.box("box") * scale))
     light = None
     if data.get("moving_light") is not None:
-        section = _Section(file, MOVING_LIGHT, data[MOVING_LIGHT], ("size", "radiance", "box"))
+        section = Section(file, MOVING_LIGHT, data[MOVING_LIGHT], ("size", "radiance", "box"))
         size = section.positive("size", (2,)) * scale
         radiance = section.numbers("radiance", (3,))
         if (radiance < 0).any() or not radiance.any():

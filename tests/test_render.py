@@ -1,0 +1,233 @@
+"""Videos by a trained method: their frames are its predictions, none is made twice, and what is wrong is said."""
+
+import json
+from types import SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+import torch
+import yaml
+from generated import spec_of
+from PIL import Image
+from tiny import write
+
+from nlt.baselines.photon_splat import PhotonSplat
+from nlt.cli import main
+from nlt.data.dataset import LightTransportDataset
+from nlt.data.render import SampleRenderer
+from nlt.data.store import points_name, write_shard
+from nlt.evaluation.export import load_trained, save_trained
+from nlt.evaluation.render import render, write_video
+from nlt.metrics.display import display
+from nlt.models.nlt import NeuralLightTransport
+from nlt.models.policy import Policy
+from nlt.rendering.renderer import Renderer
+from nlt.scenes.trajectory import cameras, follow, states, turn
+
+pytest_plugins = ["training_fixtures"]
+pytestmark = pytest.mark.usefixtures("one_thread")
+CPU = torch.device("cpu")
+SIZE = (16, 12)  # width, height
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("nlt.evaluation.render.default_device", lambda: CPU)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    """Files of methods with random weights: `nlt` with embeddings of the living room's points, `splat` without."""
+    folder = tmp_path_factory.mktemp("models")
+    torch.manual_seed(0)
+    size = {"width": 2, "depth": 1}
+    methods = {"nlt": NeuralLightTransport(photons=True, num_points=200, **size), "splat": PhotonSplat(**size)}
+    files = {name: folder / f"{name}.safetensors" for name in methods}
+    for name, method in methods.items():
+        save_trained(method, spec_of(test=3), str(files[name]))
+    return SimpleNamespace(**files)
+
+
+def pixels(path):
+    return np.asarray(Image.open(path))
+
+
+@pytest.mark.parametrize("light", [None, "turntable"])
+def test_frames_are_predictions(models, tmp_path, monkeypatch, light):
+    """Left, what the method says of the same samples, stored and read as any; right, path tracing.
+
+    Photons are cast and light is transported once for a state.
+    """
+    cast, transported = [], []
+    photons, transport = Renderer.photons, NeuralLightTransport.transport
+    monkeypatch.setattr(Renderer, "photons", lambda *a: cast.append(a) or photons(*a))
+    monkeypatch.setattr(NeuralLightTransport, "transport", lambda *a: transported.append(a) or transport(*a))
+    render(str(models.nlt), "living_room", "frames", "3", light, frames=3, resolution=SIZE, spp=2)
+    # 7 are timed, the last of them in the first frame's state.
+    assert len(cast) == len(transported) == (1 if light is None else 7 + 2)
+
+    method, spec = load_trained(str(models.nlt))
+    renderer = SampleRenderer(spec, 0)
+    views = cameras(renderer.description, "turntable", 3, *SIZE)
+    moments = states(renderer.description, "moving_lights", "3", light, 3)
+    samples, traced = [], []
+    for k, (moment, view) in enumerate(zip(moments, views, strict=True)):
+        renderer.scene.set_state(moment)
+        samples.append(renderer.view(view, np.random.SeedSequence([0]), spec.fields("test")))
+        (seed,) = np.random.SeedSequence([1, k]).generate_state(1)
+        traced.append(torch.from_numpy(renderer.radiance(view, 2, int(seed))))
+    write_shard(tmp_path / points_name(0), [renderer.points()])
+    write_shard(tmp_path / spec.shard("test", 0, 0).name, samples)
+    batch = LightTransportDataset(tmp_path, spec, "test").__getitems__([0, 1, 2])
+    with torch.no_grad(), Policy.for_device(CPU).applied(CPU):
+        predicted = torch.cat([method({name: v[k : k + 1] for name, v in batch.items()}) for k in range(3)])
+    exposure = renderer.description.exposure
+    for k in range(3):
+        expected = [255 * display(x[None], exposure)[0].permute(1, 2, 0) for x in (predicted[k], traced[k])]
+        picture = pixels(tmp_path / "frames" / f"{k:05d}.png")
+        assert (picture[:12] == np.concatenate([e.round().numpy() for e in expected], 1)).all()
+
+
+def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
+    """Frames that are there stay as they are; another command's are not mixed with them."""
+    ask = lambda **more: render(str(models.splat), "bedroom", "frames", frames=4, resolution=(8, 8), spp=1, **more)
+    ask()
+    folder = tmp_path / "frames"
+    first = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert sorted(first) == [*(f"{k:05d}.png" for k in range(4)), "render.json"]
+    Image.new("RGB", (16, 28), "red").save(folder / "00001.png")  # it would be another if it were made again
+    red = (folder / "00001.png").read_bytes()
+    for name in ("00002.png", "00003.png"):
+        (folder / name).unlink()
+    (folder / ".00002.png.elsewhere.1.tmp").write_bytes(b"half")
+    ask()
+    assert {name: (folder / name).read_bytes() for name in first} == first | {"00001.png": red}
+    (folder / ".00002.png.elsewhere.1.tmp").unlink()
+    arguments = ["render", models.splat, "bedroom", "-o", "frames", "--frames", "4", "--resolution", "8", "--spp", "1"]
+    assert main([*map(str, arguments), "--state", "1"]) == 2
+    assert "another command" in capsys.readouterr().err
+    assert (folder / "00001.png").read_bytes() == red
+
+
+def test_checkpoint_export_and_video(tiny, checkpoint, tmp_path, capsys):
+    """A checkpoint and its export make the same frames; the mp4 shows them, the PNG is the first of them."""
+    assert main(["export", str(checkpoint), "-o", "small.safetensors"]) == 0
+    size = ["--frames", "3", "--resolution", "34x17", "--state", "2", "--spp", "1"]
+    for model, output in ((checkpoint, "a"), ("small.safetensors", "b")):
+        assert main(["render", str(model), "living_room", "-o", output, *size]) == 0
+    names = [f"{k:05d}.png" for k in range(3)]
+    left = [[pixels(tmp_path / folder / name)[:17, :34] for name in names] for folder in "ab"]
+    assert (np.stack(left[0]) == np.stack(left[1])).all() and left[0][0].any()
+    assert main(["render", str(checkpoint), "living_room", "-o", "x/v.mp4", "--fps", "5", *size]) == 0
+    assert sorted(path.name for path in (tmp_path / "x").iterdir()) == ["v.json", "v.mp4", "v.png"]
+    assert (pixels(tmp_path / "x/v.png")[:17] == pixels(tmp_path / "a/00000.png")[:17]).all()
+    with av.open(str(tmp_path / "x/v.mp4")) as container:
+        stream = container.streams.video[0]
+        shown = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        codec, rate = stream.codec_context, stream.average_rate
+    assert (codec.name, codec.pix_fmt, rate, len(shown)) == ("h264", "yuv420p", 5, 3)
+    assert all(frame.shape == (38, 68, 3) for frame in shown)  # 17 + 20 of the caption, made even
+    assert json.loads((tmp_path / "x/v.json").read_text())["spp"] == 1
+
+
+def test_video_shows_its_frames(tmp_path):
+    ramp = np.linspace(0, 255, 64)[None, :, None] * np.ones((48, 1, 3))
+    images = [np.roll(ramp, 8 * k, axis=1).astype(np.uint8) for k in range(5)]
+    write_video(tmp_path / "v.mp4", iter(images), 10)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        shown = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
+    assert len(shown) == 5
+    for k, frame in enumerate(shown):
+        errors = [np.abs(frame - image).mean() for image in images]
+        assert errors[k] < 5 and int(np.argmin(errors)) == k
+
+
+# --- paths ---
+
+
+def test_turn_stays_in_the_box():
+    box = np.array([[-1.0, 2, -5], [3, 2.5, 1]])
+    points = turn(box, np.array([0.0, 1, 0]), 16)
+    assert (points >= box[0]).all() and (points <= box[1]).all() and (points[:, 1] == 2.25).all()
+    radii = (points - box.mean(0)) / (0.9 * (box[1] - box[0]) / 2)
+    np.testing.assert_allclose(np.hypot(radii[:, 0], radii[:, 2]), 1)
+    steps = np.linalg.norm(np.diff(radii, axis=0, append=radii[:1]), axis=1)
+    np.testing.assert_allclose(steps, 2 * np.sin(np.pi / 16))
+
+
+def test_follow_passes_its_keys():
+    keys = np.random.default_rng(0).normal(size=(5, 3))
+    there = follow(keys, 41, closed=False)
+    np.testing.assert_allclose(there[::10], keys)
+    for k in range(4):  # never outside of the box of two neighbours
+        part, ends = there[10 * k : 10 * k + 11], np.sort(keys[k : k + 2], axis=0)
+        assert (part >= ends[0] - 1e-9).all() and (part <= ends[1] + 1e-9).all()
+    around = follow(keys, 50, closed=True)
+    np.testing.assert_allclose(around[::10], keys)
+    np.testing.assert_allclose(follow(np.roll(keys, -2, 0), 50, closed=True), np.roll(around, -20, 0))
+    assert (follow(keys[:1], 3, closed=True) == keys[0]).all()
+
+
+def test_files_of_states_and_views(demo, tmp_path):
+    """What a state file says is where things are; a JSON file is read as well as YAML."""
+    names = [movable.name for movable in demo.movables("moving_lights")]
+    content = {"objects": {"vase": "removed", "table": [0.1, 0, 0.2]}, "light": [[-1, 2.5, 0], [1, 2.5, 0.5]]}
+    first, last = states(demo, "moving_lights", str(write(tmp_path / "s.yaml", content)), None, 2)
+    assert not first.present[names.index("vase")] and first.present.sum() == len(names) - 1
+    np.testing.assert_allclose(first.translation[names.index("table")], [0.1, 0, 0.2], atol=1e-7)
+    for moment, position in ((first, [-1, 2.5, 0]), (last, [1, 2.5, 0.5])):
+        np.testing.assert_allclose(moment.translation[-1] + demo.light.centre, position, atol=1e-6)
+    (seeded,) = states(demo, "moving_lights", str(write(tmp_path / "n.yaml", {"seed": 7})), None, 1)
+    assert seeded.key == states(demo, "moving_lights", "7", None, 1)[0].key
+    views = {"fov": 50, "views": [{"position": [0, 1, 0], "target": [1, 1, 0]}]}
+    (view,) = cameras(demo, str(write(tmp_path / "v.json", json.dumps(views))), 1, 20, 10)
+    assert view.fov == pytest.approx(50) and (view.width, view.height) == (20, 10)
+    np.testing.assert_allclose(view.position, [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(view.rotation[:, 2], [1, 0, 0], atol=1e-6)
+
+
+# --- mistakes ---
+
+
+def test_mistakes_are_one_line(models, tmp_path, refused):
+    view = {"position": [0, 1, 0], "target": [1, 1, 0]}
+    file = lambda name, content: str(write(tmp_path / name, content))
+    plain = ["render", models.splat, "living_room", "--resolution", "8", "--frames", "1"]
+    refused(["render", "nowhere.ckpt", "living_room"], "nowhere.ckpt", "cannot be read")
+    refused(["render", "nowhere.safetensors", "living_room"], "nowhere.safetensors", "cannot be read")
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(models.splat.read_bytes()[:-9])
+    refused(["render", broken, "living_room"], broken, "damaged")
+    refused(["render", models.splat, "palace"], "palace", "known scenes")
+    refused(["render", models.nlt, "bedroom"], "bedroom", "embeddings", "living_room")
+    method, _ = load_trained(str(models.nlt))
+    save_trained(method, spec_of(points=300), "more.safetensors")
+    refused(["render", "more.safetensors", "living_room"], "200 points", "300")
+    refused(["render", models.splat], "CKPT and SCENE")
+    refused(["render", "--demo", models.splat, "living_room"], "CKPT and SCENE")
+    refused([*plain, "-o", "video.avi"], "video.avi")
+    refused([*plain, "--spp", "many"], "--spp")
+    refused([*plain, "--camera-path", "nowhere.yaml"], "nowhere.yaml", "cannot be read")
+    for content, words in (
+        ({}, ["views", "missing"]),
+        ({"views": [view, {"position": [0, 0, 0]}]}, ["views[1].target", "missing"]),
+        ({"views": [{**view, "up": 1}]}, ["views[0].up", "unknown"]),
+        ({"views": [{**view, "target": [0, 1]}]}, ["views[0].target", "shape 3"]),
+        ({"views": [{**view, "target": view["position"]}]}, ["frame 0"]),
+        ("views: [", ["not valid YAML"]),
+    ):
+        path = file("path.yaml", content if isinstance(content, str) else yaml.safe_dump(content))
+        refused([*plain, "--camera-path", path], "path.yaml", *words)
+    for state, words in (
+        ({"objects": {"piano": "removed"}}, ["objects.piano", "unknown"]),
+        ({"objects": {"vase": "gone"}}, ["objects.vase"]),
+        ({"light": [0, 1, 2]}, ["light"]),
+        ({"seed": -1}, ["seed"]),
+    ):
+        refused([*plain, "--state", file("state.yaml", state)], "state.yaml", *words)
+    fixed = tmp_path / "fixed.safetensors"
+    save_trained(PhotonSplat(width=2, depth=1), spec_of(experiment="fixed_lights"), str(fixed))
+    refused(["render", fixed, "living_room", "--light", "turntable"], "--light", "fixed_lights")
+    assert not list(tmp_path.glob("video*"))
