@@ -3,7 +3,7 @@
     nlt generate --config configs/data/demo.yaml --config configs/scale/pretrained.yaml
     nlt fit --config configs/data/demo.yaml --config configs/model/photon_splat.yaml \
         --config configs/scale/pretrained.yaml --trainer.default_root_dir runs/pretrained
-    python scripts/pretrained.py runs/pretrained/lightning_logs/version_0/checkpoints/*.ckpt
+    python scripts/pretrained.py runs/pretrained/lightning_logs/version_0/checkpoints/*.ckpt $(git rev-parse HEAD)
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from nlt.training import read_checkpoint, run_lightning
 CONFIGS = [f"configs/{name}.yaml" for name in ("data/demo", "model/photon_splat", "scale/pretrained")]
 
 
-def main(checkpoint: str) -> None:
-    """Judge a checkpoint on the test split, and write it to where `nlt render --demo` finds it."""
+def main(checkpoint: str, commit: str) -> None:
+    """Judge a checkpoint that was trained at `commit`, and write it to where `nlt render --demo` finds it."""
     begun, configs = origin(), [f"--config={file}" for file in CONFIGS]
     run = read_configs([str(Path(checkpoint).absolute().parents[1] / "config.yaml")])
     trainer = run_lightning(["test", *configs, f"--ckpt_path={checkpoint}", "--trainer.logger=false"]).trainer
@@ -32,8 +32,10 @@ def main(checkpoint: str) -> None:
     save_trained(method, spec, str(DEMO))
     manifest = {
         **begun,
+        "command": f"python scripts/pretrained.py {Path(checkpoint).name} {commit}",
         "training_command": "nlt fit " + " ".join(f"--config {file}" for file in CONFIGS),
-        **surroundings(default_device()),
+        "trained_at_commit": commit,
+        **{name: value for name, value in surroundings(default_device()).items() if name != "clock"},
         "seed": run["seed_everything"],
         "model": run["model"],
         "batch_size": run["data"]["batch_size"],
@@ -48,4 +50,4 @@ def main(checkpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -58,6 +58,7 @@ ELSEWHERE = {
     "nlt compare --config demo --methods cnn normals_only": "test_compare.py::test_table",
     "nlt compare --config demo --data room": "test_compare.py::test_table",
     "nlt select --config demo --minutes 6": "test_select.py::test_end_to_end",
+    "nlt render --demo": "test_render.py::test_demo",
     "nlt report results/table2": "test_compare.py::test_drawing_again_changes_no_byte",
 }
 

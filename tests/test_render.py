@@ -18,7 +18,7 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
 from nlt.data.store import points_name, write_shard
 from nlt.evaluation.export import load_trained, save_trained
-from nlt.evaluation.render import render, write_video
+from nlt.evaluation.render import DEMO, ModelRenderer, render, write_video
 from nlt.metrics.display import display
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy
@@ -142,6 +142,26 @@ def test_video_shows_its_frames(tmp_path):
     for k, frame in enumerate(shown):
         errors = [np.abs(frame - image).mean() for image in images]
         assert errors[k] < 5 and int(np.argmin(errors)) == k
+
+
+def test_demo(tmp_path):
+    """The model that comes with nlt is small, says where it is from, and is nearer to the reference than 1 spp."""
+    assert DEMO.stat().st_size <= 5e6
+    manifest = json.loads(DEMO.with_suffix(".json").read_text())
+    assert manifest["command"] and len(manifest["commit"]) == 40 and manifest["test"]["mse"] > 0
+    assert main(["render", "--demo", "--frames", "2", "--resolution", "32", "-o", "demo.mp4"]) == 0
+    assert pixels(tmp_path / "demo.png").shape == (52, 64, 3) and (tmp_path / "demo.mp4").stat().st_size > 0
+    method, spec = load_trained(str(DEMO))
+    model = ModelRenderer(method, spec, 0, CPU)
+    errors = []
+    moments = states(spec.descriptions[0], "moving_lights", "5", "turntable", 4)
+    for moment, view in zip(moments, cameras(spec.descriptions[0], "turntable", 4, 64, 64), strict=True):
+        with torch.no_grad():
+            images = [model.frame(moment, view), *(model.traced(moment, view, spp, 1) for spp in (1, 64))]
+        shown = [display(image, 1.0) for image in images]
+        errors.append([(image - shown[2]).square().mean().item() for image in shown[:2]])
+    mine, noisy = np.mean(errors, axis=0)
+    assert mine < 0.5 * noisy
 
 
 # --- paths ---
