@@ -1,6 +1,6 @@
 """How long does the evaluation of a whole table take, stage by stage, with checkpoints at hand?
 
-    python benchmarks/evaluation.py                          # nine methods, 256 views at 64x64, all metrics
+    python benchmarks/evaluation.py                          # nine methods, 4 x 64 views at 64x64, all metrics
     python benchmarks/evaluation.py --methods cnn nlt --views 64     # a part, and what the whole would take by it
 
 Writes results/benchmarks/evaluation.json. Random weights and samples of random bytes: neither changes what is
@@ -26,7 +26,7 @@ from loading import build, synthetic
 from torchmetrics.image.fid import FrechetInceptionDistance
 
 from nlt.data.dataset import LightTransportDataset
-from nlt.data.spec import DatasetSpec
+from nlt.data.spec import DatasetSpec, load_spec
 from nlt.evaluation import judge
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.paper import published
@@ -35,7 +35,8 @@ from nlt.metrics import feature_cache, image_metrics
 from nlt.metrics.inception import Inception, _read_model, find_weights, load_inception
 from nlt.metrics.jackknife import frechet_distance
 from nlt.models.module import RenderingModule
-from nlt.paths import config_names
+from nlt.models.policy import Policy
+from nlt.paths import config_names, find_config
 
 STAGES = {
     "loading": (LightTransportDataset, "__getitems__"),
@@ -113,7 +114,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks/evaluation.json"))
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    spec = DatasetSpec(["living_room"], resolution=options.resolution, train=0, val=0, test=options.views)
+    scenes = load_spec([str(find_config("data", "dynamic_fixed_lights"))])[0].scenes
+    if options.views % len(scenes):
+        parser.error(f"--views: must be a multiple of Table 1's {len(scenes)} scenes, is {options.views}")
+    test = options.views // len(scenes)
+    spec = DatasetSpec(scenes, resolution=options.resolution, train=0, val=0, test=test)
     report: dict[str, Any] = {"options": {k: str(v) for k, v in vars(options).items()}, "methods": {}}
     report["manifest"] = origin() | surroundings(device)
     report["before_and_after"] = before_and_after()
@@ -125,7 +130,8 @@ def main() -> None:
         directory = synthetic(spec, folder)
         # Only methods that path trace ask more of it.
         frames = cast(Frames, SimpleNamespace(dataset=LightTransportDataset(directory, spec, "test")))
-        evaluation = judge.Evaluation(frames, device)
+        policy = Policy.for_device(device)
+        evaluation = judge.Evaluation(frames, device, policy)
 
         def evaluate(method: str) -> dict[str, float]:
             module = build(method, spec, options.width)
@@ -138,7 +144,7 @@ def main() -> None:
         for method in options.methods:
             report["methods"][method] = evaluate(method)
             print(method, ", ".join(f"{k} {v:.2f}" for k, v in report["methods"][method].items()), flush=True)
-        evaluation = judge.Evaluation(frames, device)
+        evaluation = judge.Evaluation(frames, device, policy)
         report["references_cached_s"] = evaluate(options.methods[0])["total"]
     rows = list(report["methods"].values())
     report["total_s"] = sum(row["total"] for row in rows)

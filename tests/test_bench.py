@@ -18,6 +18,7 @@ from nlt.metrics.quantities import NETWORK_STAGES, STAGES
 from nlt.models.method import Method
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.plain import plain
+from nlt.models.policy import Policy
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -37,7 +38,7 @@ def test_the_plain_path_is_plain():
             module.register_forward_hook(
                 lambda m, x, y: seen.append((x[0].is_contiguous(), m.weight.is_contiguous(), y.dtype))
             )
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+    with torch.no_grad(), Policy(bfloat16=True, sparse=True).applied(torch.device("cpu")):
         image = slow(synthetic_batch())
         for parameter in method.parameters():
             parameter.zero_()

@@ -336,9 +336,9 @@ def test_precision(world, trainings, monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     seen = []
 
-    def convolution(self, features):
+    def convolution(self, *features):
         seen.append(torch.is_autocast_enabled("cpu"))
-        return forward(self, features)
+        return forward(self, *features)
 
     forward = UNet.forward
     monkeypatch.setattr(UNet, "forward", convolution)
@@ -347,7 +347,7 @@ def test_precision(world, trainings, monkeypatch):
         world.compare("--methods", "cnn", *options, out=f"precision{bfloat16}")
         assert set(seen) == {bfloat16} and len(seen) > 4
         manifest = json.loads((world.folder / f"precision{bfloat16}/manifest.json").read_text())
-        assert manifest["policy"] == {"bfloat16": bfloat16}
+        assert manifest["policy"] == {"bfloat16": bfloat16, "sparse": bfloat16 and CPU.type == "cpu"}
     assert "precision: 32-true" in (world.run("cnn") / "config.yaml").read_text()
     assert len(trainings) == first  # if the first comparison's is not in float32
     if trainings:

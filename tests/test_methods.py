@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader
 from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
+from nlt.baselines.feature_projection import FeatureProjection
 from nlt.cli import main
 from nlt.errors import UserError
 from nlt.evaluation.comparison import untrained
@@ -26,6 +27,7 @@ from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.plain import plain
+from nlt.models.policy import Policy
 from nlt.paths import config_names, find_config
 
 pytest_plugins = ["training_fixtures"]
@@ -367,6 +369,23 @@ def test_a_moving_camera_reuses_the_state(method):
         here["exposure"] *= 2  # in place
         expected = method.synthesize(here, method.features(here, transport(here)))
         assert torch.equal(moving(here), expected) and len(calls) == 2
+
+
+def test_sparse_maps_make_the_same_image(method, one_thread):
+    """Only where pixels are many and no gradient is wanted."""
+    double = lambda batch: {k: v.double() if v.is_floating_point() else v for k, v in batch.items()}
+    batch, small = (double(synthetic_batch(size=size)) for size in (24, 8))
+    projects = isinstance(method, NeuralLightTransport | FeatureProjection)
+    method = method.double().eval()
+    features = lambda batch: method.features(batch, method.transport(batch))
+    with torch.no_grad():
+        expected = method(batch)
+        with Policy(sparse=True).applied(torch.device("cpu")):
+            assert isinstance(features(batch), tuple) == projects
+            torch.testing.assert_close(method(batch), expected, rtol=1e-9, atol=1e-12)
+            assert isinstance(features(small), torch.Tensor)
+            with torch.enable_grad():
+                assert torch.equal(method(batch), expected)
 
 
 _ALONE = """

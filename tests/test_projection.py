@@ -83,6 +83,15 @@ def test_equals_the_loop_over_points(project):
     assert (result.numpy()[np.broadcast_to(count == 0, expected.shape)] == 0).all()
 
 
+def test_few_points_are_seen_where_they_are_among_many():
+    """Their planes are found one by one, not for the whole image."""
+    _, positions, valid, *view = scene()
+    together = visible_pixels(positions, valid, *view)
+    few = zip(positions.split(H * W // 5, dim=1), valid.split(H * W // 5, dim=1), strict=True)
+    assert torch.equal(torch.cat([visible_pixels(*some, *view) for some in few], dim=1), together)
+    assert (together < H * W).any()
+
+
 def test_one_point_lands_in_the_floor_of_its_projection():
     eye = torch.eye(4, dtype=torch.float64)[None]
     matrix = torch.tensor([[[10.0, 0, 0], [0, 10, 0], [0, 0, 1]]], dtype=torch.float64)

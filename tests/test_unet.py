@@ -4,7 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlt.models.unet import ConvBlock, UNet, UpBlock
+from nlt.models.projection import SparseMap
+from nlt.models.unet import ConvBlock, UNet, UpBlock, sparse_convolution
 
 
 @pytest.mark.parametrize("size", [(16, 16), (13, 22), (1, 5), (8, 3)])
@@ -20,6 +21,25 @@ def test_up_block_equals_the_block_on_what_is_joined():
     x, skip = torch.randn(2, 5, 3, 4, dtype=torch.float64), torch.randn(2, 2, 6, 7, dtype=torch.float64)
     joined = torch.cat([F.interpolate(x, size=(6, 7), mode="bilinear", align_corners=False), skip], dim=1)
     torch.testing.assert_close(block(x, skip), ConvBlock.forward(block, joined))
+
+
+@pytest.mark.parametrize("size", [(5, 7), (1, 4), (3, 1)])
+def test_sparse_convolution(size):
+    """As of the dense maps, several rows at a pixel and pixels at all borders included."""
+    torch.manual_seed(0)
+    conv = torch.nn.Conv2d(9, 6, 3, padding=1).double()
+    x, sparse, dense = torch.randn(3, 2, *size, dtype=torch.float64), [], []
+    for channels in (3, 4):
+        pixels = torch.randint(3 * size[0] * size[1], (70,))
+        assert len(pixels.unique()) < 70
+        rows = torch.randn(70, channels, dtype=torch.float64)
+        image = torch.zeros(3, *size, channels, dtype=torch.float64)
+        for row, pixel in zip(rows, pixels, strict=True):
+            image.view(-1, channels)[pixel] += row
+        sparse.append(SparseMap(rows, pixels))
+        dense.append(image.permute(0, 3, 1, 2))
+    with torch.no_grad():
+        torch.testing.assert_close(sparse_convolution(conv, x, sparse), conv(torch.cat([x, *dense], dim=1)))
 
 
 def test_number_of_parameters():

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
-
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule
 from nlt.models.transport import PointEmbedding
 
 
@@ -31,7 +29,6 @@ class FeatureProjection(RenderingModule):
     def feature_channels(self) -> int:
         return GBUFFER_CHANNELS + self.hparams["embedding"]
 
-    def features(self, batch: Batch, transported: Any = None) -> Tensor:
-        features = self.embedding(batch["scene"])
-        projected = self.project(batch, features, batch["point_position"], batch["point_visible"])
-        return join([self.gbuffer(batch), projected])
+    def features(self, batch: Batch, transported: Any = None) -> Features:
+        points = (self.embedding(batch["scene"]), batch["point_position"], batch["point_visible"])
+        return self.gbuffer_and(batch, [points])

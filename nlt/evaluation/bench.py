@@ -469,9 +469,9 @@ def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:
 
 
 def _precision(clock: Clock, method: RenderingModule) -> str:
-    """In which the first convolution gives its result."""
+    """In which the last convolution gives its result."""
     found: list[torch.dtype] = []
-    hook = method.unet.conv_in.register_forward_hook(lambda _, __, output: found.append(output.dtype))
+    hook = method.unet.conv_out.register_forward_hook(lambda _, __, output: found.append(output.dtype))
     clock.flops(method)
     hook.remove()
     return str(found[0]).removeprefix("torch.")

@@ -17,7 +17,8 @@ from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
 from nlt.models.method import Batch, Method
-from nlt.models.projection import project
+from nlt.models.policy import project_sparsely
+from nlt.models.projection import SparseMap, project, project_sparse
 from nlt.models.unet import UNet
 
 # The names in a batch that the two shared inputs read.
@@ -25,6 +26,9 @@ GBUFFER = ("depth", "normal", "albedo", "view_direction")
 PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
 GBUFFER_CHANNELS = 10
+
+Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), which are valid (B, N)
+Features = Tensor | tuple[Tensor, list[SparseMap]]
 
 # What checkpoints have that were written before it could be chosen.
 _FIXED = {"points": True, "point_width": 64, "photon_width": 64}
@@ -120,8 +124,11 @@ class RenderingModule(Method, L.LightningModule):
         """Light transport, of the `state_inputs`: whatever `features` takes up again; None for a method without."""
         return None
 
-    def features(self, batch: Batch, transported: Any = None) -> Tensor:
-        """The U-Net's input (B, feature_channels, H, W), from the batch and what `transport` returned."""
+    def features(self, batch: Batch, transported: Any = None) -> Features:
+        """The U-Net's input (B, feature_channels, H, W), from the batch and what `transport` returned.
+
+        Or its first channels, and maps of the others: see `nlt.models.policy.Policy.sparse`.
+        """
         raise NotImplementedError
 
     # --- what methods share ---
@@ -135,10 +142,19 @@ class RenderingModule(Method, L.LightningModule):
         camera = (batch["camera_matrix"], batch["world_to_view"])
         return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
-    def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
+    def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud]) -> Features:
+        """The G-buffer and behind it each cloud's own map; a mean over all would mix their kinds of feature."""
+        gbuffer = self.gbuffer(batch)
+        if project_sparsely(max((len(valid[0]) for *_, valid in clouds), default=0), gbuffer[0, 0].numel()):
+            view = {name: batch[name] for name in PROJECTION}
+            return gbuffer, [project_sparse(*cloud, **view) for cloud in clouds]
+        return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds)])
+
+    def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Features to linear radiance (B, 3, H, W); the U-Net itself works in exposed radiance."""
         exposure = batch["exposure"]
-        exposed = self.unet(features.contiguous(memory_format=torch.channels_last))
+        dense, sparse = (features, []) if isinstance(features, Tensor) else features
+        exposed = self.unet(dense.contiguous(memory_format=torch.channels_last), sparse)
         # Out of what layout and, under autocast, precision the convolutions ran in.
         return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.data.sample import MATERIALS
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, log_exposed
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
 POINT_ATTRIBUTES = 3 + len(MATERIALS) + 3 + 3 + 1  # position, material, albedo, emission, visibility
@@ -79,11 +79,11 @@ class NeuralLightTransport(RenderingModule):
         colour = log_exposed(power, batch["exposure"])
         return self.photon_network(torch.cat([batch["photon_origin"], batch["photon_direction"], colour], dim=-1))
 
-    def features(self, batch: Batch, transported: Any = None) -> Tensor:
+    def features(self, batch: Batch, transported: Any = None) -> Features:
         points, photons = transported
-        maps = [self.gbuffer(batch)]
+        clouds = []
         if points is not None:
-            maps.append(self.project(batch, points, batch["point_position"], batch["point_visible"]))
-        if photons is not None:  # a map of their own: a mean over both would mix two kinds of feature
-            maps.append(self.project(batch, photons, batch["photon_hit"], batch["photon_valid"]))
-        return join(maps)
+            clouds.append((points, batch["point_position"], batch["point_visible"]))
+        if photons is not None:
+            clouds.append((photons, batch["photon_hit"], batch["photon_valid"]))
+        return self.gbuffer_and(batch, clouds)

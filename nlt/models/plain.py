@@ -16,7 +16,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.metrics.display import expose
-from nlt.models.module import Batch, RenderingModule
+from nlt.models.module import Batch, Features, RenderingModule
+from nlt.models.policy import Policy
 from nlt.models.unet import UNet
 
 
@@ -34,7 +35,8 @@ class _Plain(RenderingModule):
         camera = (batch["camera_matrix"], batch["world_to_view"])
         return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
-    def synthesize(self, batch: Batch, features: Tensor) -> Tensor:
+    def synthesize(self, batch: Batch, features: Features) -> Tensor:
+        assert isinstance(features, Tensor)
         return expose(_unet(self.unet, features.contiguous()), 1 / batch["exposure"])
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
@@ -43,19 +45,19 @@ class _Plain(RenderingModule):
 
 def _in_float32(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], Any]:
     def run(batch: Batch, result: Any) -> Any:
-        with _float32(batch["exposure"].device.type):
+        with _float32(batch["exposure"].device):
             return step(batch, result)
 
     return run
 
 
 @contextmanager
-def _float32(device: str) -> Iterator[None]:
-    """No autocast, no TF32."""
+def _float32(device: torch.device) -> Iterator[None]:
+    """No fast path of the policy's, no TF32."""
     precision = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
-        with torch.autocast(device, enabled=False), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        with Policy().applied(device), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             yield
     finally:
         torch.set_float32_matmul_precision(precision)

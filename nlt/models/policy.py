@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import torch
+
+# At fewer, maps cost less: measured at 64x64 to 1024x1024, widths 8 to 64 (docs/performance.md).
+_PIXELS_PER_POINT = 1
+_sparse: ContextVar[bool] = ContextVar("sparse", default=False)
 
 
 def default_device() -> torch.device:
@@ -20,6 +26,11 @@ def fast_bfloat16(device: torch.device) -> bool:
     return device.type == "cpu" and any("bf16" in name and has for name, has in torch.cpu.get_capabilities().items())
 
 
+def project_sparsely(points: int, pixels: int) -> bool:
+    """Whether a cloud of so many points is projected to so many pixels as a sparse map; see `Policy`."""
+    return _sparse.get() and not torch.is_grad_enabled() and pixels >= _PIXELS_PER_POINT * points
+
+
 @dataclass(frozen=True)
 class Policy:
     """How methods are trained, timed and judged. Without arguments: float32.
@@ -27,22 +38,33 @@ class Policy:
     `bfloat16`: convolutions and linear layers by autocast. Its exponent is float32's, so no loss is scaled; weights,
     Adam's state, positions, projection, loss and metrics stay float32.
 
+    `sparse`: where pixels are many, projected features stay a list of rows, which the first convolution adds up; never
+    while gradients are wanted. Without it, as in an exported program, they become maps. Not tried on a GPU.
+
     The convolutions' layout is channels_last either way, and `nlt.models.plain` the path without any of it. Neither
     torch.compile nor CUDA graphs: they were not tried on a GPU, and a CPU need not have a compiler.
     """
 
     bfloat16: bool = False
+    sparse: bool = False
 
     @classmethod
     def for_device(cls, device: torch.device, precision: str = "auto") -> Policy:
         """`precision`: auto for what the device has, 32, or bf16."""
-        return cls(bfloat16=precision == "bf16" or (precision == "auto" and fast_bfloat16(device)))
+        bfloat16 = precision == "bf16" or (precision == "auto" and fast_bfloat16(device))
+        return cls(bfloat16, sparse=precision != "32" and device.type == "cpu")
 
     @property
     def precision(self) -> str:
         """As Lightning's trainer calls it."""
         return "bf16-mixed" if self.bfloat16 else "32-true"
 
-    def applied(self, device: torch.device) -> AbstractContextManager[None]:
+    @contextmanager
+    def applied(self, device: torch.device) -> Iterator[None]:
         """What is computed within goes by the policy; stay in it for many frames, for it keeps the weights it cast."""
-        return torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16)
+        before = _sparse.set(self.sparse)
+        try:
+            with torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
+                yield
+        finally:
+            _sparse.reset(before)

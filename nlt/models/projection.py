@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+
+
+class SparseMap(NamedTuple):
+    """A feature map (B, C, H, W) that is zero but where `rows` (M, C) are added up at their `pixels`.
+
+    `pixels` (M,) int64: (image * H + row) * W + column.
+    """
+
+    rows: Tensor
+    pixels: Tensor
 
 
 def _transform(matrix: Tensor, vectors: Tensor) -> Tensor:
@@ -43,27 +55,38 @@ def visible_pixels(
     candidate = valid & in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y = torch.where(candidate, x, 0), torch.where(candidate, y, 0)
 
-    planes = _tangent_planes(camera_matrix, world_to_view, depth, normal).mT.flatten(0, 1)
+    # The plane of a pixel is n . (v - x) = 0 in view space, where v = K^-1 (K T p) and x = depth K^-1 centre.
+    to_pixels = _transform(torch.linalg.inv_ex(camera_matrix)[0].mT, world_to_view[:, :3, :3])
+    few = 4 * x.shape[1] < height * width  # then only the planes that are looked at
+    if not few:
+        column, row = (torch.arange(size, device=depth.device) for size in (width, height))
+        everywhere = (column.repeat(height), row.repeat_interleave(width))
+        planes = _tangent_planes(to_pixels, depth.flatten(2), normal.flatten(2), *everywhere).mT.flatten(0, 1)
     first = height * width * torch.arange(len(depth), device=depth.device)[:, None]
     unoccluded = torch.zeros_like(x)
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
     for i, j in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
         weight = (1 - (x - 0.5 - i).abs()) * (1 - (y - 0.5 - j).abs())
-        at = first + j.long().clamp(0, height - 1) * width + i.long().clamp(0, width - 1)
-        relative_depth = (planes[at].mT * homogeneous).sum(1)
+        column, row = i.long().clamp(0, width - 1), j.long().clamp(0, height - 1)
+        at = row * width + column
+        if few:
+            plane = _tangent_planes(to_pixels, _at(depth, at), _at(normal, at), column, row)
+        else:
+            plane = planes[first + at].mT
+        relative_depth = (plane * homogeneous).sum(1)
         unoccluded += weight * (relative_depth <= 1 + epsilon)
     return torch.where(candidate & (unoccluded > 0.5), y.long() * width + x.long(), height * width)
 
 
-def _tangent_planes(camera_matrix: Tensor, world_to_view: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
-    """(B, 3, H*W): w of each pixel, such that w . K T p is p's depth over that of the pixel's plane on p's ray."""
-    height, width = depth.shape[-2:]
-    # The plane is n . (v - x) = 0 in view space, where v = K^-1 (K T p) and x = depth K^-1 centre.
-    to_pixels = _transform(torch.linalg.inv_ex(camera_matrix)[0].mT, world_to_view[:, :3, :3])
-    m = _transform(to_pixels, normal.flatten(2).to(depth.dtype))
-    column, row = (torch.arange(size, device=depth.device, dtype=depth.dtype) + 0.5 for size in (width, height))
-    along = m[:, 0] * column.repeat(height) + m[:, 1] * row.repeat_interleave(width) + m[:, 2]
-    depth = depth.flatten(2)
+def _at(image: Tensor, pixels: Tensor) -> Tensor:
+    """Of an image (B, C, H, W) its pixels (B, K), row * W + column: (B, C, K)."""
+    return image.flatten(2).gather(2, pixels[:, None].expand(-1, image.shape[1], -1))
+
+
+def _tangent_planes(to_pixels: Tensor, depth: Tensor, normal: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """(B, 3, K): w of each of K pixels, such that w . K T p is p's depth over that of the pixel's plane on p's ray."""
+    m = _transform(to_pixels, normal.to(depth.dtype))
+    along = m[:, 0] * (column + 0.5) + m[:, 1] * (row + 0.5) + m[:, 2]
     return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit: infinitely far
 
 
@@ -101,3 +124,20 @@ def project(
     """
     pixels = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal, epsilon)
     return average(features, pixels, *depth.shape[-2:])
+
+
+def project_sparse(
+    features: Tensor,
+    positions: Tensor,
+    valid: Tensor,
+    camera_matrix: Tensor,
+    world_to_view: Tensor,
+    depth: Tensor,
+    normal: Tensor,
+) -> SparseMap:
+    """As `project`: of each visible point its feature over the number of points in its pixel."""
+    pixels, size = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal), depth[0].numel()
+    visible = pixels < size
+    at = (pixels + size * torch.arange(len(depth), device=depth.device)[:, None])[visible]
+    _, pixel, count = at.unique(return_inverse=True, return_counts=True)
+    return SparseMap(features[visible] / count[pixel, None], at)

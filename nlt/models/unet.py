@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from nlt.models.projection import SparseMap
 
 
 class ConvBlock(nn.Module):
@@ -35,11 +39,30 @@ class UpBlock(ConvBlock):
         return self._add_residual(shortcut, F.relu(torch.cat([up(x), skip], dim=1), inplace=True))
 
 
+def sparse_convolution(conv: nn.Conv2d, x: Tensor, sparse: Sequence[SparseMap]) -> Tensor:
+    """A 3x3 convolution, padded by 1, of x (B, C, H, W) and, in further channels, sparse maps of the same images."""
+    of_x, *others = conv.weight.split([x.shape[1], *(rows.shape[1] for rows, _ in sparse)], dim=1)
+    rimmed = F.conv2d(x, of_x, conv.bias, padding=2)  # by one pixel all around, where rows at the border may add
+    rimmed = rimmed.contiguous(memory_format=torch.channels_last)
+    _, channels, height, width = rimmed.shape
+    neighbours = torch.arange(3, device=x.device)[:, None] * width + torch.arange(3, device=x.device)
+    for (rows, pixels), weight in zip(sparse, others, strict=True):
+        line, column = pixels // (width - 2), pixels % (width - 2)
+        first = (line + 2 * (line // (height - 2))) * width + column  # of the nine, in the rimmed images
+        # Where the convolution looks one pixel back, a row adds one pixel ahead: hence the flip.
+        taps = weight.flip(2, 3).permute(1, 2, 3, 0).flatten(1)  # (C, 9 * out)
+        added = (rows @ taps).view(-1, channels)
+        at = (first[:, None] + neighbours.flatten()).flatten()
+        rimmed.permute(0, 2, 3, 1).view(-1, channels).index_add_(0, at, added)
+    return rimmed[..., 1:-1, 1:-1]
+
+
 class UNet(nn.Module):
     """Supplementary, "Image Synthesis Layer": (B, in_channels, H, W) -> (B, out_channels, H, W), any H, W.
 
     The supplementary's figure reduces the resolution in three steps and the main text names four blocks:
-    `depth` counts the steps. Features start at `width` and double at each. The output is not bounded.
+    `depth` counts the steps. Features start at `width` and double at each. The output is not bounded. The last of
+    the `in_channels` may be given as sparse maps.
     """
 
     def __init__(self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3) -> None:
@@ -50,8 +73,8 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(UpBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth)))
         self.conv_out = nn.Conv2d(width, out_channels, 3, padding=1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.down[0](self.conv_in(x))
+    def forward(self, x: Tensor, sparse: Sequence[SparseMap] = ()) -> Tensor:
+        x = self.down[0](sparse_convolution(self.conv_in, x, sparse) if sparse else self.conv_in(x))
         skips = []
         for block in self.down[1:]:
             skips.append(x)
