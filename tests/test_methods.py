@@ -374,7 +374,7 @@ def test_a_moving_camera_reuses_the_state(method):
 def test_sparse_maps_make_the_same_image(method, one_thread):
     """Only where pixels are many and no gradient is wanted."""
     double = lambda batch: {k: v.double() if v.is_floating_point() else v for k, v in batch.items()}
-    batch, small = (double(synthetic_batch(size=size)) for size in (24, 8))
+    batch, small = (double(synthetic_batch(size=size)) for size in (24, 7))
     projects = isinstance(method, NeuralLightTransport | FeatureProjection)
     method = method.double().eval()
     features = lambda batch: method.features(batch, method.transport(batch))
