@@ -7,7 +7,7 @@ import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -98,7 +98,7 @@ def render_suites(
     work = partial(_render, spec, suites, str(dataset), str(directory), choose_variant().name)
     with (
         tqdm(total=total, unit="view", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(Local(cores()).run(work, _jobs(missing), died)) as ticks,
+        closing(Local(cores(), preload=(LightTransportDataset.__module__,)).run(work, _jobs(missing), died)) as ticks,
     ):
         for ticked in ticks:
             bar.update((ticked or 0) - bar.n)
@@ -133,6 +133,7 @@ def _render(
 ) -> None:
     os.environ["NLT_VARIANT"] = variant
     directory, first = open_path(place), job[0]
+    spec = replace(spec, reference_spp=suites.content["reference"])
     points = read_points(open_path(dataset) / points_name(first.scene))
     seed = int(suites.content["seed"])
     if first.change in MESHES:

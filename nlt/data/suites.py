@@ -19,7 +19,7 @@ RENDERED = ("light", "geometry", "materials", "camera")  # suites whose views ar
 COMPUTED = ("budget", "frame")  # suites that change a rendered view's inputs
 SUITES = (*RENDERED, *COMPUTED, FLICKER, TRAINING)
 _KEYS = {
-    "": ("version", "seed", "views", "traced", *SUITES),
+    "": ("version", "seed", "views", "reference", "traced", *SUITES),
     FLICKER: ("draws", "frames", "camera", "light", "object"),
     TRAINING: ("share", "seeds", "learning_rate", "precision", "corrupted"),
 }
@@ -76,7 +76,7 @@ def load_suites(config: str) -> Suites:
             if not isinstance(values, list) or not 1 <= len(values) <= 5:
                 raise UserError(f"{file}: {suite}.{name}.values: must be a list of one to five numbers, is {values!r}")
             ladders.append(Ladder(suite, name, ladder["change"], tuple(map(float, values)), ladder["says"]))
-    for key in ("version", "views"):
+    for key in ("version", "views", "reference"):
         if not isinstance(content[key], int) or content[key] < 1:
             raise UserError(f"{file}: {key}: must be a whole number of at least 1, is {content[key]!r}")
     return Suites(file, content, tuple(ladders))
