@@ -16,14 +16,15 @@ from safetensors import safe_open
 from synthetic import PHOTONS, POINTS, synthetic_batch
 
 from nlt.cli import main
+from nlt.data.changed_scene import MESHES, ChangedScene
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import merge
+from nlt.data.stage import PLACES, Stage
 from nlt.data.suites import load_suites
-from nlt.data.variants import MESHES, PLACES, ChangedScene, Stage
 from nlt.errors import UserError
+from nlt.evaluation.changed_inputs import BUDGET, FRAME
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import read_rows
-from nlt.evaluation.stress import _mirrored, _photons, _points, _shifted, _spp, _turned
 from nlt.evaluation.stress_report import breaking_point
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
@@ -49,6 +50,7 @@ def test_the_manifest_names_changes_that_there_are():
         ({"views": 0}, "views: must be a whole number of at least 1"),
         ({"camera": {"near": {"change": "near", "values": [], "says": ""}}}, r"camera.near.values: must be a list"),
         ({"camera": {"near": {"change": "near", "values": [1]}}}, "camera.near: says: missing"),
+        ({"camera": {"near": {"change": "near", "values": ["a"], "says": ""}}}, r"camera.near.values: must be a list"),
     ],
 )
 def test_a_wrong_manifest(tmp_path, change, message):
@@ -202,14 +204,15 @@ def test_frames_of_the_world():
     up, middle = torch.tensor([0.0, 1, 0]).double(), torch.tensor([1.0, 2, 3]).double()
     pixels = lambda b: visible_pixels(b["point_position"], b["point_visible"], **{name: b[name] for name in PROJECTION})
     expected = pixels(batch)
-    for change, value in ((_shifted, 3.0), (_turned, 70.0)):
+    for change, value in ((FRAME["shifted"], 3.0), (FRAME["turned"], 70.0)):
         moved = change(batch, value, up, middle)
         assert not torch.allclose(moved["point_position"], batch["point_position"])
         assert torch.equal(pixels(moved), expected)
-    half = _turned(batch, 180.0, up, middle)["point_position"]
+    half = FRAME["turned"](batch, 180.0, up, middle)["point_position"]
     about = torch.tensor([2.0, 0, 6]).double() + batch["point_position"] * torch.tensor([-1, 1, -1])
     torch.testing.assert_close(half, about)
-    flipped = pixels(double(_mirrored(batch | {"camera_matrix": batch["camera_matrix"].float()}, 1, up, middle)))
+    single = batch | {"camera_matrix": batch["camera_matrix"].float()}
+    flipped = pixels(double(FRAME["mirrored"](single, 1, up, middle)))
     row, column = expected // 13, expected % 13
     assert torch.equal(flipped, torch.where(expected < 169, row * 13 + 12 - column, expected))
 
@@ -218,16 +221,16 @@ def test_budgets():
     batch = synthetic_batch()
     batch |= {f"input_{n}": torch.full_like(batch["noisy_input"], n) for n in (1, 2, 3)}
     quarter = batch["point_visible"] & (torch.arange(POINTS) < POINTS // 4)
-    assert torch.equal(_points(batch, 0.25)["point_visible"], quarter)
-    fewer = _photons(batch, 0.5)
+    assert torch.equal(BUDGET["points"](batch, 0.25)["point_visible"], quarter)
+    fewer = BUDGET["photons"](batch, 0.5)
     assert fewer["photon_hit"].shape[1] == PHOTONS // 2
     chosen = [any(torch.equal(hit, other) for other in batch["photon_hit"][0]) for hit in fewer["photon_hit"][0]]
     assert all(chosen)
     torch.testing.assert_close(fewer["photon_flux"].sum(1), batch["photon_flux"].sum(1), rtol=0.2, atol=0)
-    assert _photons(batch, 0)["photon_flux"].shape[1] == 0
-    mixed = _spp(batch, 2.5)["noisy_input"]
+    assert BUDGET["photons"](batch, 0)["photon_flux"].shape[1] == 0
+    mixed = BUDGET["spp"](batch, 2.5)["noisy_input"]
     assert set(mixed.unique().tolist()) == {2.0, 3.0} and mixed.mean().item() == pytest.approx(2.5, abs=0.15)
-    assert (_spp(batch, 1)["noisy_input"] == 1).all()
+    assert (BUDGET["spp"](batch, 1)["noisy_input"] == 1).all()
 
 
 @pytest.mark.parametrize(
@@ -267,6 +270,15 @@ def stressed(tiny, tmp_path_factory):
         yield SimpleNamespace(command=command, directory=out / "stress", folder=folder, methods=methods)
     finally:
         os.chdir(here)
+
+
+def test_an_unknown_change(stressed, tmp_path, capsys):
+    content = yaml.safe_load(MANIFEST.read_text())
+    content["light"] = {"odd": {"change": "points", "values": [1], "says": "of another kind"}}
+    file = tmp_path / "odd.yaml"
+    file.write_text(yaml.safe_dump(content))
+    assert main([*stressed.command[:-1], str(file)]) == 2
+    assert "light.odd.change: must be one of roughness, " in capsys.readouterr().err
 
 
 def test_rows(stressed):
@@ -329,6 +341,6 @@ def test_again_changes_nothing(stressed, monkeypatch):
     names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.png")
     before = {name: (stressed.directory / name).read_bytes() for name in names}
     monkeypatch.setattr("nlt.data.stress.Local", None)
-    monkeypatch.setattr("nlt.evaluation.stress._Views.judge", None)
+    monkeypatch.setattr("nlt.evaluation.stress_views.SuiteViews.judge", None)
     assert main(stressed.command) == 0
     assert {name: (stressed.directory / name).read_bytes() for name in names} == before

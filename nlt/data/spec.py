@@ -208,6 +208,16 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return {**base, **over, **both}
 
 
+def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], needed: Collection[str] = ()) -> None:
+    """Raises UserError if a key of a config's section is not known, or one that is needed is missing."""
+    for key in content:
+        if key not in known:
+            raise UserError(f"{place}{key}: unknown key; known are {', '.join(known)}")
+    for key in needed:
+        if key not in content:
+            raise UserError(f"{place}{key}: missing")
+
+
 def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
     """The dataset that config files describe, without what is rendered online; the root directory of datasets."""
     where = " + ".join(files)
@@ -218,9 +228,7 @@ def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
     dataset = tuple(field.name for field in dataclasses.fields(DatasetSpec))
     sections = (("", merged, SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
     for section, content, known in sections:
-        for key in content:
-            if key not in known:
-                raise UserError(f"{where}: {section}{key}: unknown key; known are {', '.join(known)}")
+        check_keys(f"{where}: {section}", content, known)
     if "scenes" not in data["dataset"]:
         raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
     spec, online = DatasetSpec(**data["dataset"]), data.get("online", False)

@@ -24,6 +24,7 @@ from nlt.errors import UserError
 MANIFEST = "manifest.json"
 CRC = "crc:"
 _OPEN_FILES = 128
+Points = dict[str, np.ndarray]  # a scene's point cloud, by field
 
 
 def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
@@ -94,7 +95,7 @@ class ShardReader:
             return self._files[path]
 
 
-def read_points(path: AnyPath) -> dict[str, np.ndarray]:
+def read_points(path: AnyPath) -> Points:
     """The point cloud of a scene: all of `POINT_FIELDS`."""
     return ShardReader().read(path, 0, POINT_FIELDS)
 

@@ -15,20 +15,21 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from nlt.data.changed_scene import MESHES, ChangedScene
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Local, cores
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import ShardReader, points_name, read_points, write_shard
-from nlt.data.suites import CLEAN, FLICKER, RENDERED, Suites
-from nlt.data.variants import MESHES, ChangedScene, Points, Stage, lacks, path
+from nlt.data.stage import Stage, lacks, path
+from nlt.data.store import Points, ShardReader, points_name, read_points, write_shard
+from nlt.data.suites import CLEAN, FLICKER, PATHS, RENDERED, Suites
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 from nlt.scenes.camera import Camera
 from nlt.scenes.pointcloud import sample_points
 
-DRAWS, PATH, PATHS = "draws", "path", ("camera", "light", "object")
+DRAWS, PATH = "draws", "path"
 FEWER_SPP = (1, 2, 3)  # per input pixel, of the clean views
 _DRAWN = ("noisy_input", "photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid")
 

@@ -10,17 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from nlt.data.files import AnyPath, open_path
-from nlt.data.spec import DatasetSpec, read_configs
+from nlt.data.spec import DatasetSpec, check_keys, read_configs
 from nlt.errors import UserError
 from nlt.paths import find_config
 
 CLEAN, FLICKER, TRAINING = "clean", "flicker", "training"
 RENDERED = ("light", "geometry", "materials", "camera")  # suites whose views are rendered
 COMPUTED = ("budget", "frame")  # suites that change a rendered view's inputs
+PATHS = ("camera", "light", "object")  # of flicker: what moves
 SUITES = (*RENDERED, *COMPUTED, FLICKER, TRAINING)
 _KEYS = {
     "": ("version", "seed", "views", "reference", "traced", *SUITES),
-    FLICKER: ("draws", "frames", "camera", "light", "object"),
+    FLICKER: ("draws", "frames", *PATHS),
     TRAINING: ("share", "seeds", "learning_rate", "precision", "corrupted"),
 }
 _LADDER = ("change", "values", "says")
@@ -73,7 +74,11 @@ def load_suites(config: str) -> Suites:
         for name, ladder in content[suite].items():
             _check(file, f"{suite}.{name}", ladder, _LADDER)
             values = ladder["values"]
-            if not isinstance(values, list) or not 1 <= len(values) <= 5:
+            if (
+                not isinstance(values, list)
+                or not 1 <= len(values) <= 5
+                or any(type(v) not in (int, float) for v in values)
+            ):
                 raise UserError(f"{file}: {suite}.{name}.values: must be a list of one to five numbers, is {values!r}")
             ladders.append(Ladder(suite, name, ladder["change"], tuple(map(float, values)), ladder["says"]))
     for key in ("version", "views", "reference"):
@@ -86,9 +91,4 @@ def _check(file: Path, section: str, content: Any, known: tuple[str, ...]) -> No
     place = f"{file}: {section + ': ' if section else ''}"
     if not isinstance(content, Mapping):
         raise UserError(f"{place}must be a mapping with the keys {', '.join(known)}, is {content!r}")
-    for key in content:
-        if key not in known:
-            raise UserError(f"{place}{key}: unknown key; known are {', '.join(known)}")
-    for key in known:
-        if key not in content:
-            raise UserError(f"{place}{key}: missing")
+    check_keys(place, content, known, known)

@@ -6,7 +6,7 @@ import pydoc
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from nlt.data.spec import read_configs
+from nlt.data.spec import check_keys, read_configs
 from nlt.errors import UserError
 from nlt.evaluation.paper import order, tables
 from nlt.models.method import Method
@@ -48,9 +48,7 @@ class Comparison:
         """
         file = find_config("compare", config)
         content = read_configs([str(file)])
-        for key in content:
-            if key not in _KEYS:
-                raise UserError(f"{file}: {key}: unknown key; known are {', '.join(_KEYS)}")
+        check_keys(f"{file}: ", content, _KEYS)
         names = [file.stem]
         for key, value in (("scale", scale), ("data", data)):
             if value and value != content.get(key):

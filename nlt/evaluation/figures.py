@@ -35,7 +35,7 @@ _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 _CURVES = ("0.3", "#8C510A", "#000000")
-_HALO = [withStroke(linewidth=1.5, foreground="white")]
+HALO = [withStroke(linewidth=1.5, foreground="white")]
 
 
 def draw_samples(results: Results) -> None:
@@ -195,7 +195,7 @@ def _speed_accuracy(axis: plt.Axes, results: Results, key: str, at: Mapping[str,
         for number, m in enumerate(found):
             part = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
             axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
-                          fontsize=7, color=style["color"], zorder=4, path_effects=_HALO)  # fmt: skip
+                          fontsize=7, color=style["color"], zorder=4, path_effects=HALO)  # fmt: skip
     for k, m in enumerate(m for m in results.methods if m not in in_curves):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": "", "marker": MARKERS[k % len(MARKERS)]}
         _plot(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from nlt.data.files import AnyPath
-from nlt.data.spec import DatasetSpec, load_spec, merge, read_configs
+from nlt.data.spec import DatasetSpec, check_keys, load_spec, merge, read_configs
 from nlt.errors import UserError
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
@@ -66,12 +66,7 @@ class Ladder:
         """
         file = find_config("select", config)
         content = {"seeds": 1} | read_configs([str(file)]) | ({} if minutes is None else {"minutes": minutes})
-        for key in content:
-            if key not in _KEYS:
-                raise UserError(f"{file}: {key}: unknown key; known are {', '.join(_KEYS)}")
-        for key in _KEYS:
-            if key not in content:
-                raise UserError(f"{file}: {key}: missing")
+        check_keys(f"{file}: ", content, _KEYS, _KEYS)
         for key in ("data", "scale"):
             if not isinstance(content[key], str):
                 raise UserError(f"{file}: {key}: must be the name of a config of configs/{key}, is {content[key]!r}")

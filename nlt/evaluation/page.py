@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import math
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from html import escape
@@ -26,7 +27,8 @@ from nlt.evaluation.gallery import FAILURES, Shown, failures
 from nlt.evaluation.packing import max_error, pack_to_fit
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
-from nlt.evaluation.stress_report import STRESS
+from nlt.evaluation.stress_report import BREAKING, ROWS, STRESS, TEXT, TRAININGS, introduction, load_stress, paragraphs
+from nlt.evaluation.stress_report import tables as stress_tables
 from nlt.evaluation.tables import Table, heading, tables, text
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
@@ -41,6 +43,7 @@ _FILES = (
     *("table.csv", "table.md", "table.tex", "runs.csv", "timings.csv", "views.csv"),
     *("failures.csv", "failures.md", "failures.tex", "claims.md", "claims.json", "manifest.json"),
 )
+_STRESS_FILES = (ROWS, BREAKING, TRAININGS, TEXT, "manifest.json")
 _WEBP = 90  # quality of pixel figures, which lie beside the report as they are
 
 
@@ -58,8 +61,9 @@ def write_page(results: Results, claims: list[Claim]) -> None:
         "claims": _claims(results, claims),
         "tables": "\n".join(_table(results, table, number) for number, table in enumerate(tables(results))),
         "failures": _failures(results),
-        "files": _files(results),
-        "figures": _figures(results),
+        "files": _files(results.directory, _FILES),
+        "figures": _figures(results.directory),
+        "stress": _stress(results.directory / STRESS),
         "provenance": _provenance(results),
     }
     packed, data = _images(results, _SIZE - sum(map(len, parts.values())) - _OTHER)
@@ -225,7 +229,7 @@ def _grid(name: str, title: str, table: Table, origins: _Origins, best: Collecti
         )
         of_row = origin(origins.rows[r] if origins.rows else "")
         rows.append(f'<tr data-index="{r}"{of_row}><th scope="row">{escape(head)}</th>{cells}</tr>')
-    headings = zip(["method", *table.columns], ["lower", *directions], ["", *origins.columns], strict=True)
+    headings = zip([table.first, *table.columns], ["lower", *directions], ["", *origins.columns], strict=True)
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(title)}">'
         f'<table class="grid" id="{escape(name)}" aria-label="{escape(title)}"{origin(origins.table)}><thead><tr>'
@@ -316,11 +320,29 @@ def _failures(results: Results) -> str:
     return _titled(table, _grid("failures", table.title, table, origins))
 
 
-def _figures(results: Results) -> str:
+def _stress(directory: Path) -> str:
+    """The section on what the stress suites say; nothing where they were not tried."""
+    stressed = load_stress(directory)
+    if stressed is None:
+        return ""
+    parts = ['<section id="stress" aria-labelledby="stress-title">', '<h2 id="stress-title">Where methods fail</h2>']
+    parts += [f"<p>{_marked_up(text)}</p>" for text in (introduction(stressed), *paragraphs(stressed))]
+    for number, table in enumerate(stress_tables(stressed)):
+        origins = _Origins(f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}", [""] * len(table.columns))
+        parts.append(_titled(table, _grid(f"stress-{number}", table.title, table, origins)))
+    files = f'<p class="note">As files: {_files(directory, _STRESS_FILES)}.</p>'
+    return "\n".join([*parts, _figures(directory), files, "</section>"])
+
+
+def _marked_up(text: str) -> str:
+    """Markdown's strong text and code as HTML."""
+    code = re.sub(r"`(.*?)`", r"<code>\1</code>", escape(text))
+    return re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", code)
+
+
+def _figures(directory: Path) -> str:
     """The pictures beside the results, as vectors where there are both."""
-    places = (results.directory, results.directory / STRESS)
-    # .svg comes after .png
-    found = {path.stem: path for place in places for path in sorted(place.glob("*.[ps][nv]g"))}
+    found = {path.stem: path for path in sorted(directory.glob("*.[ps][nv]g"))}  # .svg comes after .png
     return "\n".join(
         f'<figure><img alt="{escape(name.replace("_", " "))}" src="{_picture(path)}">'
         f"<figcaption>{escape(name.replace('_', ' ').capitalize())}</figcaption></figure>"
@@ -340,9 +362,9 @@ def _url(content: bytes, mime: str) -> str:
     return f"data:{mime};base64,{base64.b64encode(content).decode()}"
 
 
-def _files(results: Results) -> str:
+def _files(directory: Path, names: Iterable[str]) -> str:
     """Links that hold the tables and raw numbers as files."""
-    found = [path for name in _FILES if (path := results.directory / name).exists()]
+    found = [path for name in names if (path := directory / name).exists()]
     return ", ".join(
         f'<a download="{path.name}" href="{_url(path.read_bytes(), "text/plain")}">{path.name}</a>' for path in found
     )

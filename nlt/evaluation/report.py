@@ -10,7 +10,8 @@ from nlt.evaluation.gallery import Shown, draw_failures, draw_qualitative
 from nlt.evaluation.learning_curves import draw_learning_curves
 from nlt.evaluation.page import write_page
 from nlt.evaluation.results import load
-from nlt.evaluation.stress_report import STRESS, draw_stress
+from nlt.evaluation.stress_figures import draw_stress
+from nlt.evaluation.stress_report import STRESS
 from nlt.evaluation.tables import write_tables
 
 

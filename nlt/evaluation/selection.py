@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-from matplotlib.patheffects import withStroke
 
+from nlt.evaluation.figures import COLOURS, HALO, MARKERS, save
 from nlt.evaluation.paper import label
 from nlt.evaluation.tables import heading, text
 from nlt.metrics.quantities import QUANTITIES
@@ -17,11 +17,6 @@ from nlt.metrics.quantities import QUANTITIES
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-matplotlib.rcParams["svg.hashsalt"] = "nlt"  # the same drawing gives the same bytes
-
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")  # Okabe and Ito
-_MARKERS = "osD^v*P"
-_HALO = [withStroke(linewidth=1.5, foreground="white")]
 _SCORES = ("unbiased_mse", "mssim")
 _COSTS = ("time_per_frame_s", "parameters", "peak_memory_bytes")
 Row = Mapping[str, Any]
@@ -109,7 +104,7 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
     for axis, key in zip(axes, _SCORES, strict=True):
         labelled = 0
         for k, method in enumerate(methods):
-            style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "ls": ""}
+            style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "ls": ""}
             for row in (row for row in scored if row["method"] == method):
                 final = f"{key}_behind" in row
                 at = (1e3 * row["time_per_frame_s"], row[key])
@@ -120,13 +115,13 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
                     if row[role]:
                         axis.plot(*at, "o", ms=ring, mfc="none", mec=colour, mew=1.8)
                         axis.annotate(role, at, (0, 13), textcoords="offset points", ha="center", fontsize=8,
-                                      weight="bold", color=colour, path_effects=_HALO, zorder=5)  # fmt: skip
+                                      weight="bold", color=colour, path_effects=HALO, zorder=5)  # fmt: skip
                 if final:
                     what = row["candidate"].partition("@")[2].replace(" points", "").replace(" photons", "")
                     labelled += 1
                     below = (0, -18 - 9 * (labelled % 2))
                     axis.annotate(what, at, below, textcoords="offset points", ha="center", fontsize=6,
-                                  path_effects=_HALO, zorder=5)  # fmt: skip
+                                  path_effects=HALO, zorder=5)  # fmt: skip
             axis.plot([], [], label=label(method), **style)
         axis.set_xscale("log")
         if key == "unbiased_mse" and min(row[key] for row in scored) > 0:
@@ -143,9 +138,7 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
     figure.suptitle(title, fontsize=9)
     axes[0].legend(fontsize=8)
     figure.tight_layout()
-    for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-        figure.savefig(directory / f"front.{kind}", dpi=150, metadata=metadata)
-    plt.close(figure)
+    save(figure, directory, "front")
 
 
 def row_of(rows: Sequence[Row], role: str) -> Row:

@@ -1,4 +1,4 @@
-"""What the stress suites say, made from their rows alone: tables, sentences, curves, heat map, gallery."""
+"""What the stress suites say, made from their rows alone: tables and sentences."""
 
 from __future__ import annotations
 
@@ -7,28 +7,21 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
-import matplotlib
 import numpy as np
 import scipy.stats
 
 from nlt.data.files import write_bytes
-from nlt.data.suites import CLEAN, COMPUTED, FLICKER, RENDERED
-from nlt.evaluation.figures import COLOURS, DASHES, MARKERS, grid, save, shown
+from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
 from nlt.evaluation.paper import label, order
-from nlt.evaluation.results import IMAGES, MANIFEST, OK, read_rows, write_rows
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from nlt.evaluation.results import MANIFEST, OK, read_rows, write_rows
+from nlt.evaluation.tables import Table, as_markdown
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
 DOUBLED = 2.0  # times the clean error: broken
-_CEILING = 1e3  # where curves end
-_WORST = 8  # rows of the gallery
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
-_MOVES = ("camera", "light", "object")
+_NONE = "–"
 
 
 @dataclass(frozen=True)
@@ -115,20 +108,13 @@ def load_stress(directory: Path) -> Stressed | None:
     )
 
 
-def draw_stress(directory: Path) -> None:
-    """breaking.csv, stress.md and the figures, from the rows in a directory; nothing where there are none."""
-    stressed = load_stress(directory)
-    if stressed is None:
-        return
-    write_rows(directory / BREAKING, _table(stressed))
-    write_bytes(directory / TEXT, _text(stressed).encode())
-    if stressed.ladders:
-        _curves(stressed)
-        _heat_map(stressed)
-        _gallery(stressed)
+def write_stress(stressed: Stressed) -> None:
+    """breaking.csv and stress.md."""
+    write_rows(stressed.directory / BREAKING, _rows(stressed))
+    write_bytes(stressed.directory / TEXT, _text(stressed).encode())
 
 
-def _table(stressed: Stressed) -> list[dict[str, Any]]:
+def _rows(stressed: Stressed) -> list[dict[str, Any]]:
     """A row per method and ladder: errors and their growth by severity, the breaking point, ranks."""
     rows = []
     for ladder in stressed.ladders:
@@ -154,21 +140,35 @@ def _ranks(errors: list[np.ndarray]) -> np.ndarray:
 
 
 def _text(stressed: Stressed) -> str:
+    lines = ["# Where methods fail", "", introduction(stressed), ""]
+    for paragraph in paragraphs(stressed):
+        lines += [paragraph, ""]
+    for table in tables(stressed):
+        lines += as_markdown(table, 2)
+    return "\n".join([*lines, f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}."]) + "\n"
+
+
+def introduction(stressed: Stressed) -> str:
+    """What was measured, of what, and what was left out."""
     manifest = stressed.manifest
-    lines = [
-        "# Where methods fail",
-        "",
+    return (
         f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: {manifest['views']} views of "
         f"{', '.join(manifest['scenes'])} at each severity, suites of version {manifest['manifest']['version']}. "
         "Errors are squared, relative to the reference's square (plus 0.01) at each pixel, without the reference's "
-        "noise; a method breaks where its error is twice that of the clean views.",
-        "",
-        *(_about(stressed, method) for method in stressed.methods),
-    ]
-    lines += _breaking_table(stressed) + _rank_lines(stressed) + _flicker_table(stressed) + _training_table(stressed)
-    if manifest.get("left_out"):
-        lines += ["", "Left out: " + "; ".join(manifest["left_out"]) + "."]
-    return "\n".join(lines) + "\n"
+        "noise; a method breaks where its error is twice that of the clean views."
+        + (f" Left out: {'; '.join(manifest['left_out'])}." if manifest["left_out"] else "")
+    )
+
+
+def paragraphs(stressed: Stressed) -> list[str]:
+    """Markdown, one for each method."""
+    return [_about(stressed, method) for method in stressed.methods]
+
+
+def tables(stressed: Stressed) -> list[Table]:
+    """Breaking points, ranks, flicker, trainings: those of them that there are."""
+    found = [_breaking(stressed), _ranking(stressed), _flicker(stressed), _training(stressed)]
+    return [table for table in found if table.rows]
 
 
 def _about(stressed: Stressed, method: str) -> str:
@@ -197,179 +197,75 @@ def _about(stressed: Stressed, method: str) -> str:
         parts.append(f"It withstands: {', '.join(held)}.")
     bad = stressed.nonfinite(method)
     parts.append(f"**{bad} pixels are not finite.**" if bad else "Every output is finite.")
-    return " ".join(parts) + "\n"
+    return " ".join(parts)
 
 
-def _breaking_table(stressed: Stressed) -> list[str]:
-    if not stressed.ladders:
-        return []
-    head = [label(method) for method in stressed.methods]
-    lines = ["## Breaking points", "", "Severity at which the error doubles; > where it does not up to the highest; "
-             "in brackets the growth there.", "", "| | " + " | ".join(head) + " |",
-             "|---|" + "---:|" * len(head)]  # fmt: skip
+def _breaking(stressed: Stressed) -> Table:
+    rows = []
     for ladder in stressed.ladders:
         cells = []
         for method in stressed.methods:
             growth = stressed.growth(method, ladder)
-            at = breaking_point(growth) if len(growth) else math.nan
-            cells.append("–" if not len(growth) else f"{_severity(at, len(growth) - 1)} ({growth[-1]:.2g})")
-        lines.append(f"| {ladder[0]}: {stressed.says(ladder)} | " + " | ".join(cells) + " |")
-    return lines
+            at = breaking_point(growth)
+            cells.append(f"{severity(at, len(growth) - 1)} ({growth[-1]:.2g})" if len(growth) else _NONE)
+        rows.append([f"{ladder[0]}: {stressed.says(ladder)}", *cells])
+    note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
+    return Table("Breaking points", note, [label(method) for method in stressed.methods], rows, first="ladder")
 
 
-def _severity(at: float, highest: int) -> str:
+def severity(at: float, highest: int) -> str:
+    """A breaking point as it is printed."""
     return f"{at:.1f}" if math.isfinite(at) else f"> {highest}"
 
 
-def _rank_lines(stressed: Stressed) -> list[str]:
+def _ranking(stressed: Stressed) -> Table:
     """How the order of the methods at the highest severity compares to that of the clean views."""
-    lines = ["", "## Ranks", "", "| | best, clean | best at the highest severity | Kendall's τ of the two orders |",
-             "|---|---|---|---:|"]  # fmt: skip
+    rows = []
     for ladder in stressed.ladders:
         errors = {m: e for m in stressed.methods if len(e := stressed.errors(m, ladder))}
         if len(errors) > 1:
             names, values = list(errors), np.stack(list(errors.values()))
             tau = scipy.stats.kendalltau(values[:, 0], values[:, -1]).statistic
             first, last = (label(names[int(values[:, k].argmin())]) for k in (0, -1))
-            lines.append(f"| {ladder[0]}: {stressed.says(ladder)} | {first} | {last} | {tau:.2f} |")
-    return lines if len(lines) > 6 else []
+            rows.append([f"{ladder[0]}: {stressed.says(ladder)}", first, last, _number(tau, ".2f")])
+    columns = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
+    return Table("Ranks", "", columns, rows, first="ladder")
 
 
-def _flicker_table(stressed: Stressed) -> list[str]:
-    if not any(row["suite"] == FLICKER for row in stressed.rows):
-        return []
-    lines = ["", "## Flicker", "", "Standard deviation of a pixel over draws in a fixed scene, in % of the image's "
-             "root mean square; and the mean square change from frame to frame on a smooth path, over the reference's.",
-             "", "| | " + " | ".join([*_FLICKERS.values(), *(f"path of the {kind}" for kind in _MOVES)]) + " |",
-             "|---|" + "---:|" * 6]  # fmt: skip
-    for method in stressed.methods:
+def _flicker(stressed: Stressed) -> Table:
+    rows = []
+    for method in stressed.methods if any(row["suite"] == FLICKER for row in stressed.rows) else ():
         draws = [100 * stressed.flicker(method, kind) for kind in _FLICKERS]
-        moves = [stressed.flicker(method, kind) for kind in _MOVES]
-        cells = [_number(v, ".2f") for v in draws] + [_number(v, ".3g") for v in moves]
-        lines.append(f"| {label(method)} | " + " | ".join(cells) + " |")
-    return lines
+        moves = [stressed.flicker(method, kind) for kind in PATHS]
+        cells = [_number(v, ".2f") for v in draws] + [_number(v) for v in moves]
+        rows.append([label(method), *cells])
+    note = (
+        "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
+        "square change from frame to frame on a smooth path, over the reference's."
+    )
+    return Table("Flicker", note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], rows)
 
 
-def _training_table(stressed: Stressed) -> list[str]:
-    if not stressed.trainings:
-        return []
-    rows = stressed.trainings
-    kinds = list(dict.fromkeys((row["variation"], str(row["value"])) for row in rows if row["variation"] != "seed"))
+def _training(stressed: Stressed) -> Table:
+    rows, trained = [], stressed.trainings
+    kinds = list(dict.fromkeys((r["variation"], str(r["value"])) for r in trained if r["variation"] != "seed"))
     content = stressed.manifest["manifest"]["training"]
-    lines = ["", "## Training", "", f"Trained anew for {content['share']:.0%} of the steps: the error over "
-             f"{content['seeds']} seeds (mean ± standard deviation), and that of one seed with a change.", "",
-             "| | seeds | " + " | ".join(f"{a} {b}" for a, b in kinds) + " |",
-             "|---|" + "---:|" * (len(kinds) + 1)]  # fmt: skip
-    for method in dict.fromkeys(row["method"] for row in rows):
-        own = [row for row in rows if row["method"] == method]
+    for method in dict.fromkeys(row["method"] for row in trained):
+        own = [row for row in trained if row["method"] == method]
         seeds = np.array([row["error"] for row in own if row["variation"] == "seed" and row["status"] == OK])
         lost = sum(row["status"] != OK for row in own if row["variation"] == "seed")
         spread = f"{seeds.mean():.3g} ± {seeds.std(ddof=1):.2g}" if len(seeds) > 1 else _number(seeds.sum() or math.nan)
         cells = [spread + (f", {lost} lost" if lost else "")]
         for kind in kinds:
             row = next((row for row in own if (row["variation"], str(row["value"])) == kind), None)
-            cells.append("–" if row is None else row["status"] if row["status"] != OK else _number(row["error"]))
-        lines.append(f"| {label(method)} | " + " | ".join(cells) + " |")
-    return lines
+            cells.append(_NONE if row is None else row["status"] if row["status"] != OK else _number(row["error"]))
+        rows.append([label(method), *cells])
+    note = (
+        f"Trained anew for {content['share']:.0%} of the steps: the error over {content['seeds']} seeds "
+        "(mean ± standard deviation), and that of one seed with a change."
+    )
+    return Table("Training", note, ["seeds", *(f"{a} {b}" for a, b in kinds)], rows)
 
 
 def _number(value: float, form: str = ".3g") -> str:
-    return format(value, form) if math.isfinite(value) else "–"
-
-
-# --- in pictures ---
-
-
-def _curves(stressed: Stressed) -> None:
-    """stress_curves: growth of the error over severity, a panel per ladder, on one scale."""
-    columns = 6
-    count = math.ceil(len(stressed.ladders) / columns)
-    figure, axes = plt.subplots(
-        count, columns, figsize=(2.4 * columns, 2 * count + 0.6), squeeze=False, sharex=True, sharey=True
-    )
-    for axis in axes.flat[len(stressed.ladders) :]:
-        axis.set_axis_off()
-    for axis, ladder in zip(axes.flat, stressed.ladders, strict=False):
-        for k, method in enumerate(stressed.methods):
-            growth = stressed.growth(method, ladder)
-            if len(growth):
-                axis.plot(
-                    np.clip(growth, 1 / DOUBLED**2, _CEILING), DASHES[k // len(COLOURS) % len(DASHES)], lw=1, ms=3,
-                    marker=MARKERS[k % len(MARKERS)], color=COLOURS[k % len(COLOURS)], label=label(method),
-                )  # fmt: skip
-        axis.axhline(DOUBLED, color="0.6", lw=0.8, ls=":")
-        axis.set_yscale("log")
-        axis.set_title(f"{ladder[0]}: {stressed.says(ladder)}", fontsize=6.5)
-        axis.set_xticks(range(6))
-        axis.tick_params(labelsize=7, labelbottom=True)
-        axis.grid(alpha=0.3)
-    figure.supylabel("error over clean error, by severity", fontsize=8)
-    found = {
-        label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(found.values(), found.keys(), loc="lower center", ncols=7, fontsize=7, frameon=False)
-    figure.tight_layout(rect=(0.01, 0.15 / count + 0.01, 1, 1))
-    save(figure, stressed.directory, "stress_curves")
-
-
-def _heat_map(stressed: Stressed) -> None:
-    """stress_map: the breaking point of every method on every ladder; darker is earlier, blank is not concerned."""
-    methods, ladders = stressed.methods, stressed.ladders
-    points = np.full((len(ladders), len(methods)), np.nan)
-    highest = np.full(len(ladders), 5)
-    for i, ladder in enumerate(ladders):
-        for j, method in enumerate(methods):
-            growth = stressed.growth(method, ladder)
-            if len(growth):
-                points[i, j], highest[i] = breaking_point(growth), len(growth) - 1
-    figure, axis = plt.subplots(figsize=(2.6 + 0.55 * len(methods), 1.4 + 0.22 * len(ladders)))
-    axis.imshow(np.minimum(points, 5.5), cmap="cividis", vmin=0, vmax=5.5, aspect="auto")
-    for (i, j), at in np.ndenumerate(points):
-        if not math.isnan(at):
-            colour = "white" if min(at, 5.5) < 3 else "black"
-            axis.text(j, i, _severity(at, int(highest[i])), ha="center", va="center", fontsize=6.5, color=colour)
-    axis.set_xticks(range(len(methods)), [label(m) for m in methods], rotation=40, ha="right", fontsize=7)
-    axis.set_yticks(range(len(ladders)), [f"{s}: {stressed.says((s, n))}" for s, n in ladders], fontsize=7)
-    axis.set_title("Severity at which the error doubles", fontsize=8)
-    figure.tight_layout()
-    save(figure, stressed.directory, "stress_map")
-
-
-def _gallery(stressed: Stressed) -> None:
-    """stress_worst: the views whose error grew most at a ladder's highest severity: reference and every method."""
-    found = []
-    for ladder in stressed.ladders:
-        if ladder[0] not in RENDERED:
-            continue
-        for method in stressed.methods:
-            rows = [r for r in stressed.rows if (r["method"], r["suite"], r["ladder"]) == (method, *ladder)]
-            top = [row for row in rows if row["severity"] == max(r["severity"] for r in rows)]
-            for place, row in enumerate(top):
-                found.append((row["error"] / stressed.clean(method), ladder, place, method))
-    chosen: dict[tuple[str, str], tuple[float, int]] = {}
-    for growth, ladder, place, _ in sorted(found, reverse=True):
-        chosen.setdefault(ladder, (growth, place))
-    picked = sorted(chosen.items(), key=lambda item: -item[1][0])[:_WORST]
-    suites = {ladder[0] for ladder, _ in picked}
-    stored = {(s, m): _images(stressed, s, m) for s in suites for m in ("reference", *stressed.methods)}
-    if not picked or not all(stored[suite, "reference"] for suite in suites):
-        return  # images stay on the machine that made them
-    methods = [m for m in stressed.methods if all(stored[suite, m] for suite in suites)]
-    figure, axes = grid(len(picked), ["Reference", *(label(m) for m in methods)])
-    for row, ((suite, name), (growth, place)) in zip(axes, picked, strict=True):
-        exposure = float(stored[suite, "reference"]["exposure"][place])
-        for axis, m in zip(row, ("reference", *methods), strict=True):
-            axis.imshow(shown(stored[suite, m][name][place], exposure), interpolation="nearest")
-        row[0].text(
-            0.02, 0.03, f"{fill(stressed.says((suite, name)), 18)}\n{growth:.3g}x", transform=row[0].transAxes,
-            fontsize=6, color="white", bbox={"facecolor": "black", "alpha": 0.6, "pad": 1, "lw": 0},
-        )  # fmt: skip
-    save(figure, stressed.directory, "stress_worst", ("png",))
-
-
-def _images(stressed: Stressed, suite: str, method: str) -> dict[str, np.ndarray]:
-    path = stressed.directory / IMAGES / f"{suite}-{method}.npz"
-    if not path.exists():
-        return {}
-    with np.load(path) as file:
-        return dict(file)
+    return format(value, form) if math.isfinite(value) else _NONE

@@ -24,7 +24,7 @@ _NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as text, a row per method; the first column is its name."""
+    """Cells as text, a row per method or whatever else `first` says; the first column is its name."""
 
     title: str
     note: str
@@ -32,6 +32,7 @@ class Table:
     rows: list[list[str]]
     # Of each column: its quantity, and the results that it is from. Empty for a table that is not of quantities.
     sources: list[tuple[str, Results]] = field(default_factory=list)
+    first: str = "method"
 
 
 def text(key: str, value: float | None) -> str:
@@ -145,15 +146,19 @@ def _summary(results: Results, method: str) -> dict[str, Any]:
     return row
 
 
+def as_markdown(table: Table, level: int) -> list[str]:
+    """Its lines, below a heading of this level."""
+    return [
+        f"{'#' * level} {table.title}", "", *([table.note, ""] if table.note else []),
+        f"| {table.first} | {' | '.join(table.columns)} |", "|---|" + "---:|" * len(table.columns),
+        *(f"| {' | '.join(row)} |" for row in table.rows), "",
+    ]  # fmt: skip
+
+
 def _markdown(found: list[Table], source: str) -> str:
     lines = []
     for number, table in enumerate(found, 1):
-        lines += [f"{'#' * min(number, 2)} {table.title}", ""]
-        if table.note:
-            lines += [table.note, ""]
-        lines += [f"| method | {' | '.join(table.columns)} |", "|---|" + "---:|" * len(table.columns)]
-        lines += [f"| {' | '.join(row)} |" for row in table.rows]
-        lines.append("")
+        lines += as_markdown(table, min(number, 2))
     return "\n".join([*lines, f"Where the numbers come from: manifest.json, {source}."]) + "\n"
 
 
@@ -171,7 +176,7 @@ def _latex(found: list[Table]) -> str:
         lines += [
             r"\begin{table}", r"\centering\footnotesize", f"\\caption{{{caption}}}",
             f"\\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule",
-            " & ".join(map(escape, ["method", *table.columns])) + r" \\", r"\midrule",
+            " & ".join(map(escape, [table.first, *table.columns])) + r" \\", r"\midrule",
             *(" & ".join(map(escape, row)) + r" \\" for row in table.rows),
             r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
         ]  # fmt: skip
