@@ -318,6 +318,10 @@ def test_end_to_end(ladder, tiny, monkeypatch, capsys):
     text = Path("out/table.md").read_text()
     ratio = float(confirmed["full model"]["time_per_frame_s"]) / float(confirmed["chosen"]["time_per_frame_s"])
     assert f"- {'holds' if ratio >= 2 else 'FAILS'}: at least 2x cheaper per frame: {ratio:.2f}x" in text
+    fewest = min((r for r in finals if r["candidate"] in eligible), key=lambda r: float(r["parameters"]))
+    assert confirmed["by parameters"]["candidate"] == fewest["candidate"]
+    same = "gives the same model" if fewest == chosen else f"gives {fewest['candidate']}: "
+    assert f"- compared: picking by the number of parameters {same}" in text
     for name in ("front.png", "front.svg", "advice.md"):
         assert Path("out", name).stat().st_size > 100
     manifest = json.loads(Path("out/manifest.json").read_text())

@@ -186,7 +186,7 @@ def _speed_accuracy(axis: plt.Axes, results: Results, key: str, at: Mapping[str,
     """A panel: the methods at their places, time in ms and metric."""
     families = curves(results)
     in_curves = {method for members in families.values() for method in members}
-    if front := _pareto_front(at, METRICS[key].direction):
+    if front := pareto_front(at, METRICS[key].direction):
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
     for k, (name, members) in enumerate(families.items()):
         found = [m for m in members if m in at]
@@ -259,7 +259,7 @@ def curves(results: Results) -> dict[str, list[str]]:
     return curves
 
 
-def _pareto_front(at: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:
+def pareto_front(at: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:
     """The (time, value) places that no other place is better than in both, by time."""
     sign = 1 if direction == "lower" else -1
     front: list[tuple[float, float]] = []

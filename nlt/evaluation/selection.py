@@ -9,7 +9,7 @@ from typing import Any
 
 import matplotlib
 
-from nlt.evaluation.figures import COLOURS, HALO, MARKERS, save
+from nlt.evaluation.figures import COLOURS, HALO, MARKERS, pareto_front, save
 from nlt.evaluation.paper import label
 from nlt.evaluation.tables import heading, text
 from nlt.metrics.quantities import QUANTITIES
@@ -32,8 +32,8 @@ def markdown(name: str, rows: Sequence[Row], confirmed: Sequence[Row], record: M
     if len(by) < len(_SCORES):
         rule += " alone: no candidate is by both"
     lines = [f"# The model that {name} needs", "", f"**{chosen['candidate']}**: {rule}."]
-    if full:
-        lines += ["", *(f"- {verdict}: {claim}" for claim, verdict in claims(chosen, full))]
+    against = claims(chosen, full) if full else []
+    lines += ["", *(f"- {verdict}: {claim}" for claim, verdict in against), f"- {_by_parameters(confirmed)}"]
     size = f"{record['n_test']} views, {len(record['seeds'])} seeds"
     how = "in brackets how much worse than the full model, ± the paired standard error"
     lines += ["", f"On the test split ({size}); {how}:", ""]
@@ -65,6 +65,16 @@ def claims(chosen: Row, full: Row) -> list[tuple[str, str]]:
     saved = ", ".join(f"{QUANTITIES[key].label} {_saved(key, chosen, full)}" for key in _COSTS)
     verdicts = [(claim, "holds" if holds else "FAILS") for claim, holds in found]
     return [*verdicts, (saved, "saved")]
+
+
+def _by_parameters(rows: Sequence[Row]) -> str:
+    """What the choice would have been by the number of parameters instead of the time per frame."""
+    chosen, fewest = row_of(rows, "chosen"), row_of(rows, "by parameters")
+    if chosen["candidate"] == fewest["candidate"]:
+        return "compared: picking by the number of parameters gives the same model"
+    ratio = fewest["time_per_frame_s"] / chosen["time_per_frame_s"]
+    scores = ", ".join(f"{heading(key)} {text(key, fewest[key])} for {text(key, chosen[key])}" for key in _SCORES)
+    return f"compared: picking by the number of parameters gives {fewest['candidate']}: {ratio:.2f}x the time, {scores}"
 
 
 def _names(keys: Sequence[str]) -> str:
@@ -103,6 +113,11 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
     scored = [row for row in rows if _SCORES[0] in row]
     for axis, key in zip(axes, _SCORES, strict=True):
         labelled = 0
+        finals = {
+            row["candidate"]: (1e3 * row["time_per_frame_s"], row[key]) for row in scored if f"{key}_behind" in row
+        }
+        front = pareto_front(finals, QUANTITIES[key].direction)
+        axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
         for k, method in enumerate(methods):
             style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "ls": ""}
             for row in (row for row in scored if row["method"] == method):
@@ -155,6 +170,7 @@ def summary(found: Mapping[str, Sequence[Row]]) -> str:
         if any(row["role"] == "full model" for row in rows):
             pairs = claims(row_of(rows, "chosen"), row_of(rows, "full model"))
             lines += [f"- {verdict}: {case}: {claim}" for claim, verdict in pairs]
+        lines.append(f"- {case}: {_by_parameters(rows)}")
     lines += ["", "On the test split; in brackets how much worse than the full model, ± the paired standard error.", ""]
     return "\n".join([*lines, *_confirmed(found), ""])
 
