@@ -1,7 +1,8 @@
 """Copies what the documentation shows out of results/ and the code: `python scripts/update_readme.py`.
 
 A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
-(`results/NAME/table.md`), a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
+(`results/NAME/table.md`), what the stress suites say (`results/NAME/stress/stress.md`), a group of fields
+(`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
 """
 
 import re
@@ -21,7 +22,14 @@ def content(source: str) -> str:
         return field_table(getattr(sample, name))
     if path == "scripts/paper_scale.py":
         return str(runpy.run_path(str(PROJECT / path))["tables"](PROJECT / "results/bench/target"))
-    return first_table(PROJECT / path)
+    return body(PROJECT / path) if path.endswith("/stress.md") else first_table(PROJECT / path)
+
+
+def body(path: Path) -> str:
+    """A Markdown file without its title, a level lower; what makes it, where it is not there."""
+    if not path.exists():
+        return f"Not measured yet: `nlt stress --config {path.parts[-3]}`, then `python scripts/update_readme.py`."
+    return re.sub(r"^#", "##", path.read_text().partition("\n")[2].strip(), flags=re.MULTILINE)
 
 
 def first_table(path: Path) -> str:
@@ -43,7 +51,7 @@ def field_table(fields: dict[str, sample.Field]) -> str:
 
 def update(text: str) -> str:
     """The text with every block made anew."""
-    block = re.compile(r"<!-- (results/\S+/table\.md|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
+    block = re.compile(r"<!-- (results/\S+\.md|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
     return block.sub(lambda m: f"<!-- {m[1]} -->\n{content(m[1])}\n<!-- end -->", text)
 
 
