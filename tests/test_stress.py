@@ -12,6 +12,7 @@ import torch
 import trimesh
 import yaml
 from generated import spec_of
+from made_results import make_results, papers_numbers
 from safetensors import safe_open
 from synthetic import PHOTONS, POINTS, synthetic_batch
 
@@ -23,8 +24,10 @@ from nlt.data.stage import PLACES, Stage
 from nlt.data.suites import load_suites
 from nlt.errors import UserError
 from nlt.evaluation.changed_inputs import BUDGET, FRAME
+from nlt.evaluation.page import write_page
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import read_rows
+from nlt.evaluation.results import read_rows, write_manifest, write_rows
+from nlt.evaluation.stress_figures import draw_stress
 from nlt.evaluation.stress_report import breaking_point
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
@@ -239,6 +242,67 @@ def test_budgets():
 )
 def test_breaking_point(growth, point):
     assert breaking_point(np.array(growth)) == pytest.approx(point)
+
+
+# --- what rows say ---
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Made-up rows beside made-up results of a comparison, drawn; one pixel of the CNN is not finite."""
+    directory = tmp_path_factory.mktemp("made")
+    names = ("cnn", "nlt", "denoising_1_4")
+    numbers = papers_numbers("table2")
+    results = make_results(directory, {name: numbers[name] for name in names}, "table2", images=True)
+    growing = {"cnn": (0.1, 1.0), "nlt": (0.2, 0.05), "denoising_1_4": (0.3, 0.0)}  # clean, and by severity
+    rows = []
+    for name, (clean, slope) in growing.items():
+        places = [("clean", "views", 0), *(("light", "brighter", k) for k in range(1, 6))]
+        places += [("budget", "points", k) for k in range(1, 6) if name == "nlt"]
+        for suite, ladder, severity in places:
+            errors = clean * (1 + (slope if suite == "light" else 1) * severity) * np.array([0.5, 1.5])
+            rows += [
+                {"method": name, "suite": suite, "ladder": ladder, "severity": severity, "scene": 0, "view": view,
+                 "error": error, "nonfinite": int((name, severity, view) == ("cnn", 5, 1))}
+                for view, error in enumerate(errors)
+            ]  # fmt: skip
+    write_rows(directory / "stress" / "stress.csv", rows)
+    record = {"command": "nlt stress", "commit": "c" * 40, "views": 2, "scenes": ["room"], "left_out": ["a thing"]}
+    write_manifest(directory / "stress", record | {"manifest": yaml.safe_load(MANIFEST.read_text())})
+    draw_stress(directory / "stress")
+    write_page(results, [])
+    return directory
+
+
+def test_breaking_points_and_ranks(made):
+    rows = {(row["method"], row["ladder"]): row for row in read_rows(made / "stress" / "breaking.csv")}
+    assert rows["cnn", "brighter"]["breaks_at"] == pytest.approx(1)
+    assert rows["nlt", "brighter"]["breaks_at"] == np.inf and rows["nlt", "points"]["breaks_at"] == pytest.approx(1)
+    assert [rows["cnn", "brighter"][f"growth_{k}"] for k in range(6)] == pytest.approx([1, 2, 3, 4, 5, 6])
+    ranks = {name: [rows[name, "brighter"][f"rank_{k}"] for k in (0, 5)] for name in ("cnn", "nlt", "denoising_1_4")}
+    assert ranks == {"cnn": [1, 3], "nlt": [2, 1], "denoising_1_4": [3, 2]}
+
+
+def test_sentences(made):
+    """Where a method breaks, by how much, and what is better there: also one that the change does not reach."""
+    text = (made / "stress" / "stress.md").read_text()
+    cnn, nlt = label("cnn"), label("nlt")
+    for sentence in (
+        f"**{cnn}** has a clean error of 0.1. It breaks with brighter light at severity 1.0 (6 times the clean error "
+        f"at severity 5; there {nlt} has 0.25 against its 0.6). **1 pixels are not finite.**",
+        f"6 times the clean error at severity 5; there {cnn} has 0.1 against its 1.2). It withstands: brighter light.",
+        "Left out: a thing.",
+    ):
+        assert sentence in text
+
+
+def test_report(made):
+    """Sentences, tables and pictures are a section of report.html."""
+    page = (made / "report.html").read_text()
+    section = page[page.index('<section id="stress"') :].partition("</section>")[0]
+    assert f"<strong>{label('cnn')}</strong> has a clean error of 0.1." in section
+    assert section.count("<figure>") == 2 and section.count("<table") == 2 and 'download="stress.csv"' in section
+    assert "> 5 (1.2)" in section.replace("&gt;", ">")
 
 
 # --- the command ---

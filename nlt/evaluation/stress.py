@@ -7,11 +7,13 @@ severities. Everything else there is made from these: nlt/evaluation/stress_repo
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from nlt.data.changed_scene import MESHES
 from nlt.data.generate import generate
@@ -27,7 +29,7 @@ from nlt.evaluation.page import write_page
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
 from nlt.evaluation.stress_figures import draw_stress
-from nlt.evaluation.stress_report import ROWS, STRESS
+from nlt.evaluation.stress_report import ROWS, STRESS, TRAININGS
 from nlt.evaluation.stress_training import train_suite
 from nlt.evaluation.stress_views import SuiteViews
 from nlt.evaluation.trainings import Training, check, train
@@ -72,9 +74,12 @@ def stress(
     }  # fmt: skip
     print("".join(f"left out: {reason}\n" for reason in record["left_out"]), end="", flush=True)
     rows = [row for row in _old(directory / ROWS) if row["suites"] == rendered.name]
+    before = _measured(directory)
     shown = set[str]()  # suites whose references are written
-    for number, name in enumerate(comparison.methods, 1):
-        print(f"[{number}/{len(comparison.methods)}] {name}", flush=True)
+    judged = [CLEAN, *(suite for suite in SUITES if suite in wanted and suite != TRAINING)]
+    bar = tqdm(total=len(comparison.methods) * len(judged), unit="suite", file=sys.stderr, mininterval=1.0)
+    for name in comparison.methods:
+        bar.set_description(f"judging {name}")
         method, took = untrained(name), dict[str, Any]()
         try:
             if method is None and trainings[name] in died:
@@ -83,30 +88,35 @@ def stress(
                 method, took = trainings[name].load(device)
         except DivergedError as problem:
             record["left_out"].append(f"{name}: {problem}")
-            print(f"left out: {record['left_out'][-1]}")
+            bar.write(f"left out: {record['left_out'][-1]}")
+            bar.update(len(judged))
             continue
         label = {"method": name, "suites": rendered.name, "run": Path(took.get("run", name)).name}
         rows = [row for row in rows if row["method"] != name or row["run"] == label["run"]]
-        for suite in [CLEAN, *(suite for suite in SUITES if suite in wanted and suite != TRAINING)]:
+        for suite in judged:
+            own = sum((row["method"], row["suite"]) == (name, suite) for row in rows)
             images = directory / IMAGES / f"{suite}-{name}.npz"
-            mark = f"{rendered.name} {label['run']}"
-            if images.exists() and str(np.load(images)["mark"]) == mark:
-                continue
-            found, radiance = views.judge(method, suite)
-            rows = [row for row in rows if (row["method"], row["suite"]) != (name, suite)]
-            rows += [{**label, "suite": suite, **row} for row in found]
-            write_rows(directory / ROWS, rows)
-            write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
-            if suite not in (FLICKER, *shown):
-                write_images(directory, f"{suite}-reference", **views.references(suite))
-                shown.add(suite)
-            write_images(directory, images.stem, **radiance, mark=np.array(mark))  # the last: all is there
+            mark = f"{rendered.name} {label['run']} {content.content.get(suite)}"
+            if not _is_there(images, mark, own):
+                found, radiance = views.judge(method, suite)
+                rows = [row for row in rows if (row["method"], row["suite"]) != (name, suite)]
+                rows += [{**label, "suite": suite, **row} for row in found]
+                write_rows(directory / ROWS, rows)
+                write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
+                if suite not in (FLICKER, *shown):
+                    write_images(directory, f"{suite}-reference", **views.references(suite))
+                    shown.add(suite)
+                # The last: all is there.
+                write_images(directory, images.stem, **radiance, mark=np.array(mark), rows=np.array(len(found)))
+            bar.update()
+    bar.close()
     write_rows(directory / ROWS, rows)
     if TRAINING in wanted:
         clean = views.batches(CLEAN)["views", 0]
         error = lambda method: float(np.mean([row["error"] for row in views.rows(method, clean)[0]]))
         train_suite(directory, comparison, content.content[TRAINING], runs, error, device)
-    write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
+    if _measured(directory) != before:  # else the manifest is of the run that measured it
+        write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
     draw_stress(directory)
     if (directory.parent / RUNS).exists():  # of `nlt compare`: its report shows this, too
         results = load(directory.parent)
@@ -123,6 +133,18 @@ def _check_changes(suites: Suites) -> None:
         if ladder.change not in known:
             place = f"{suites.file}: {ladder.suite}.{ladder.name}.change"
             raise UserError(f"{place}: must be one of {', '.join(known)}, is {ladder.change!r}")
+
+
+def _is_there(images: Path, mark: str, rows: int) -> bool:
+    """Whether a suite was judged to its end: of the same views and method, and no row was lost since."""
+    if not images.exists():
+        return False
+    with np.load(images) as file:
+        return "rows" in file and (str(file["mark"]), int(file["rows"])) == (mark, rows)
+
+
+def _measured(directory: Path) -> list[bytes]:
+    return [path.read_bytes() for name in (ROWS, TRAININGS) if (path := directory / name).exists()]
 
 
 def _old(path: Path) -> list[dict[str, Any]]:

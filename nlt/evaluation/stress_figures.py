@@ -90,7 +90,8 @@ def _heat_map(stressed: Stressed) -> None:
 
 
 def _gallery(stressed: Stressed) -> None:
-    """stress_worst: the views whose error grew most at a ladder's highest severity: reference and every method."""
+    """stress_worst: the views whose error grew most at a ladder's highest severity: reference and every method, the
+    one whose error grew so framed."""
     found = []
     for ladder in stressed.ladders:
         if ladder[0] not in RENDERED:
@@ -100,9 +101,9 @@ def _gallery(stressed: Stressed) -> None:
             top = [row for row in rows if row["severity"] == max(r["severity"] for r in rows)]
             for place, row in enumerate(top):
                 found.append((row["error"] / stressed.clean(method), ladder, place, method))
-    chosen: dict[tuple[str, str], tuple[float, int]] = {}
-    for growth, ladder, place, _ in sorted(found, reverse=True):
-        chosen.setdefault(ladder, (growth, place))
+    chosen: dict[tuple[str, str], tuple[float, int, str]] = {}
+    for growth, ladder, place, method in sorted(found, reverse=True):
+        chosen.setdefault(ladder, (growth, place, method))
     picked = sorted(chosen.items(), key=lambda item: -item[1][0])[:_WORST]
     suites = {ladder[0] for ladder, _ in picked}
     stored = {(s, m): _images(stressed, s, m) for s in suites for m in ("reference", *stressed.methods)}
@@ -110,10 +111,13 @@ def _gallery(stressed: Stressed) -> None:
         return  # images stay on the machine that made them
     methods = [m for m in stressed.methods if all(stored[suite, m] for suite in suites)]
     figure, axes = grid(len(picked), ["Reference", *(label(m) for m in methods)])
-    for row, ((suite, name), (growth, place)) in zip(axes, picked, strict=True):
+    for row, ((suite, name), (growth, place, worst)) in zip(axes, picked, strict=True):
         exposure = float(stored[suite, "reference"]["exposure"][place])
         for axis, m in zip(row, ("reference", *methods), strict=True):
             axis.imshow(shown(stored[suite, m][name][place], exposure), interpolation="nearest")
+            if m == worst:
+                frame = {"fill": False, "ec": COLOURS[1], "lw": 4, "transform": axis.transAxes}
+                axis.add_patch(plt.Rectangle((0, 0), 1, 1, **frame))
         row[0].text(
             0.02, 0.03, f"{fill(stressed.says((suite, name)), 18)}\n{growth:.3g}x", transform=row[0].transAxes,
             fontsize=6, color="white", bbox={"facecolor": "black", "alpha": 0.6, "pad": 1, "lw": 0},

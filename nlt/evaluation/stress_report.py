@@ -70,6 +70,11 @@ class Stressed:
         found = [max(self._means[key], 0.0) for key in keys if key in self._means]
         return np.array([self.clean(method), *found]) if found else np.zeros(0)
 
+    def worst(self, method: str, ladder: tuple[str, str]) -> float:
+        """The error at the highest severity; the clean error of a method that a ladder does not concern."""
+        errors = self.errors(method, ladder)
+        return float(errors[-1]) if len(errors) else self.clean(method)
+
     def growth(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
         """(S + 1,) `errors` over the clean error."""
         errors = self.errors(method, ladder)
@@ -178,8 +183,8 @@ def _about(stressed: Stressed, method: str) -> str:
     held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
     parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
     for at, ladder in broken[:5]:
-        growth, own = stressed.growth(method, ladder), stressed.errors(method, ladder)[-1]
-        rivals = {m: e[-1] for m in stressed.methods if m != method and len(e := stressed.errors(m, ladder))}
+        growth, own = stressed.growth(method, ladder), stressed.worst(method, ladder)
+        rivals = {m: stressed.worst(m, ladder) for m in stressed.methods if m != method}
         best = min(rivals, key=rivals.__getitem__, default=None)
         advice = ""
         if best is not None and rivals[best] < own:
