@@ -70,10 +70,10 @@ class Stressed:
         found = [max(self._means[key], 0.0) for key in keys if key in self._means]
         return np.array([self.clean(method), *found]) if found else np.zeros(0)
 
-    def worst(self, method: str, ladder: tuple[str, str]) -> float:
-        """The error at the highest severity; the clean error of a method that a ladder does not concern."""
+    def error(self, method: str, ladder: tuple[str, str], severity: int) -> float:
+        """The error at a severity; the clean error of a method that a ladder does not concern."""
         errors = self.errors(method, ladder)
-        return float(errors[-1]) if len(errors) else self.clean(method)
+        return float(errors[severity]) if len(errors) else self.clean(method)
 
     def growth(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
         """(S + 1,) `errors` over the clean error."""
@@ -183,8 +183,10 @@ def _about(stressed: Stressed, method: str) -> str:
     held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
     parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
     for at, ladder in broken[:5]:
-        growth, own = stressed.growth(method, ladder), stressed.worst(method, ladder)
-        rivals = {m: stressed.worst(m, ladder) for m in stressed.methods if m != method}
+        growth = stressed.growth(method, ladder)
+        worst = int(growth.argmax())  # not always the highest: a camera at a wall sees less than one before it
+        own = stressed.error(method, ladder, worst)
+        rivals = {m: stressed.error(m, ladder, worst) for m in stressed.methods if m != method}
         best = min(rivals, key=rivals.__getitem__, default=None)
         advice = ""
         if best is not None and rivals[best] < own:
@@ -193,7 +195,7 @@ def _about(stressed: Stressed, method: str) -> str:
             advice = f"; yet no other method has less than its {own:.3g} there"
         parts.append(
             f"It breaks with {stressed.says(ladder)} at severity {at:.1f} "
-            f"({growth[-1]:.3g} times the clean error at severity {len(growth) - 1}{advice})."
+            f"({growth[worst]:.3g} times the clean error at severity {worst}{advice})."
         )
     if len(broken) > 5:
         rest = ", ".join(f"{stressed.says(ladder)} ({at:.1f})" for at, ladder in broken[5:])
