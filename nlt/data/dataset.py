@@ -116,9 +116,9 @@ def collated(batch: Any) -> Any:
 
 def _stack(tensors: list[Tensor]) -> Tensor:
     """As torch.stack, halves as float32; what all samples share, the static points of one scene, is not copied."""
-    if all(tensor is tensors[0] for tensor in tensors):
-        return tensors[0].expand(len(tensors), *tensors[0].shape)
     dtype = tensors[0].dtype
+    if dtype != torch.float16 and all(tensor is tensors[0] for tensor in tensors):
+        return tensors[0].expand(len(tensors), *tensors[0].shape)
     out = torch.empty(len(tensors), *tensors[0].shape, dtype=torch.float32 if dtype == torch.float16 else dtype)
     for row, tensor in zip(out, tensors, strict=True):
         row.copy_(tensor)
