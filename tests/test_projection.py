@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nlt.models import plain
-from nlt.models.projection import project, visible_pixels
+from nlt.models.projection import project, project_sparse, visible_pixels
 
 H, W = 12, 16
 
@@ -181,9 +181,10 @@ def test_nothing_is_hit():
 def test_bfloat16_features_count_beyond_256():
     """A mean of equal features is that feature, however many there are."""
     eye = torch.eye(4)[None]
-    result = project(
+    scene = (
         torch.ones(1, 1000, 1, dtype=torch.bfloat16), torch.tensor([[[0.0, 0, 1]]]).expand(1, 1000, 3),
         torch.ones(1, 1000, dtype=torch.bool), torch.eye(3)[None], eye, torch.zeros(1, 1, H, W),
         torch.zeros(1, 3, H, W),
     )  # fmt: skip
-    assert result[0, 0, 0, 0] == 1
+    assert project(*scene)[0, 0, 0, 0] == 1
+    assert [part.tolist() for part in project_sparse(*scene)] == [[[1.0]], [0]]

@@ -135,9 +135,11 @@ def project_sparse(
     depth: Tensor,
     normal: Tensor,
 ) -> SparseMap:
-    """As `project`: of each visible point its feature over the number of points in its pixel."""
+    """As `project`: a row for each pixel in which a point is visible."""
     pixels, size = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal), depth[0].numel()
     visible = pixels < size
     at = (pixels + size * torch.arange(len(depth), device=depth.device)[:, None])[visible]
-    _, pixel, count = at.unique(return_inverse=True, return_counts=True)
-    return SparseMap(features[visible] / count[pixel, None], at)
+    seen, row, count = at.unique(return_inverse=True, return_counts=True)
+    features = features[visible].to(torch.promote_types(features.dtype, torch.float32))  # as in `total`
+    sums = features.new_zeros(len(seen), features.shape[1]).index_add_(0, row, features)
+    return SparseMap(sums / count[:, None], seen)
