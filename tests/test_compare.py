@@ -505,7 +505,14 @@ def test_what_is_judged_is_kept(world, monkeypatch):
 
     first, again = judge("one"), judge("one")
     assert (first[0], again[0]) == (2, 0) and first[1] == again[1] and first[2] != again[2]
-    assert [judge("one", changes=True)[0], judge("two")[0]] == [2, 2]
+    assert [judge("one", changes=True)[0], judge("two")[0], judge(None)[0], judge("two")[0]] == [2, 2, 2, 0]
+    file = world.folder / "configs/model/path_tracing_1.yaml"
+    before = file.read_text()
+    try:  # the same name and commit, but a config that no commit has
+        file.write_text(before.replace("spp: 1", "spp: 2"))
+        assert judge("two")[0] == 1
+    finally:
+        file.write_text(before)
 
 
 def test_history(world, more_methods):

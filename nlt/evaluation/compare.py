@@ -41,6 +41,7 @@ from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
 
+JUDGED = "judged.npz"  # in a run's directory
 _ROW = ("method", "seed", "train_images", "status", "message")  # of training_images.csv, before its metrics
 
 
@@ -87,21 +88,9 @@ def compare(
     record = {
         **begun,
         **surroundings(device, policy),
-        "comparison": comparison.name,
-        "table": comparison.table,
-        "methods": comparison.methods,
-        "seeds": comparison.seeds,
+        **_subject(comparison, test),
         "train_images": sorted(train_images),
-        "dataset": dataset.name,
-        "scenes": [description.name for description in spec.descriptions],
-        "teachers": frames.teachers(),
-        "n_test": len(test),
-        "shown": test.shown,
-        "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
     }
-    # What decides a judgement; by code that has no name none is kept.
-    key = {name: record[name] for name in ("commit", "versions", "device", "policy", "inception_weights")}
-    of = None if begun["uncommitted_changes"] else key
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
     for number, (method, seed) in enumerate(jobs, 1):
@@ -112,7 +101,8 @@ def compare(
             if module is None:
                 training = trainings[method, seed, None]
                 (module, took), place = _trained(training, died, device), training.run
-            metrics, each, radiance = test.evaluate_once(module, place / "judged.npz", of and of | took)
+            of = _decides(record, method, took)
+            metrics, each, radiance = test.evaluate_once(module, place / JUDGED, of)
             run |= clock.time(module) | metrics | clock.size(module) | took
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
             run["spp"] = (module.spp or spec.input_spp) if "path_tracing" in module.stages else 0
@@ -132,19 +122,48 @@ def compare(
     # What the table's own trainings saw is a point of the curve, too.
     images = [{**run, "train_images": spec.train} for run in runs if train_images and not untrained(run["method"])]
     rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in images]
-    for training in trainings.values():
-        if training.train_images:
-            row = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
-            with _noted(row):
-                module, took = _trained(training, died, device)
-                row |= test.evaluate_once(module, training.run / "judged.npz", of and of | took)[0]
-            rows.append(row)
-            print(f"{training.name}: {row['status']} {row['message']}", flush=True)
+    rows += [_on_fewer(training, died, test, record) for training in trainings.values() if training.train_images]
     if rows:
         write_rows(directory / TRAINING_IMAGES, rows)
     draw(directory)
     print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     return directory
+
+
+def _subject(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
+    """What is compared, and on what, for the manifest."""
+    return {
+        "comparison": comparison.name,
+        "table": comparison.table,
+        "methods": comparison.methods,
+        "seeds": comparison.seeds,
+        "dataset": test.directory.name,
+        "scenes": [description.name for description in test.spec.descriptions],
+        "teachers": test.frames.teachers(),
+        "n_test": len(test),
+        "shown": test.shown,
+        "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
+    }
+
+
+def _on_fewer(
+    training: Training, died: Mapping[Training, str], test: Evaluation, record: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A row of training_images.csv, of a training on some of the images."""
+    row: dict[str, Any] = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
+    with _noted(row):
+        module, took = _trained(training, died, test.device)
+        row |= test.evaluate_once(module, training.run / JUDGED, _decides(record, training.method, took))[0]
+    print(f"{training.name}: {row['status']} {row['message']}", flush=True)
+    return row
+
+
+def _decides(record: Mapping[str, Any], method: str, took: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What decides how a method is judged; None by code that has no name."""
+    if not record["commit"] or record["uncommitted_changes"]:
+        return None
+    names = ("commit", "versions", "device", "policy", "inception_weights")
+    return {**{name: record[name] for name in names}, "config": record["configs"][method], **took}
 
 
 @contextmanager

@@ -26,13 +26,15 @@ _PACKAGES = (
     "mitsuba-oidn",
 )  # fmt: skip
 
+_CODE = ("nlt", "configs", "scripts", "benchmarks", "pyproject.toml")  # what numbers come from
+
 
 def origin() -> dict[str, Any]:
     """Command, commit and time, taken when the command begins: the checkout may change while it runs."""
     return {
         "command": shlex.join(["nlt", *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!results")),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--", *_CODE)),  # files that are not tracked, too
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
 
