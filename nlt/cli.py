@@ -20,6 +20,7 @@ _LIGHTNING = {
 
 # Words of several commands' help.
 _OUT, _IMAGE = "directory of the results (default: {})", "image to write (default: {})"
+_PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
 _VIEWS, _SIDE = "random views of each scene", "height and width of an image"
 
 
@@ -232,7 +233,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
-    board.add_argument("--port", type=int, default=6006, help="of the server (default: 6006; 0 takes a free one)")
+    board.add_argument("--port", type=_whole, default=6006, help="of the server (default: 6006; 0 takes a free one)")
     for command in (report, board):
         command.add_argument("directory", help="of results, as nlt compare wrote them")
     teachers = commands.add_parser("teachers", help="compare path and bdpt: variance at equal time, scene by scene")
@@ -251,7 +252,7 @@ def _add_views(parser: argparse.ArgumentParser, **numbers: tuple[int, str]) -> N
         "--experiment", type=_experiment, default="fixed_lights",
         help="static, fixed_lights or moving_lights (default: fixed_lights)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of states, views and noise (default: 0)")
+    parser.add_argument("--seed", type=_whole, default=0, help="of states, views and noise (default: 0)")
 
 
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
@@ -320,7 +321,7 @@ def _add_scenes(parser: argparse.ArgumentParser) -> None:
     add.add_argument("--name", help="of the scene (default: the file's, or its folder's for scene.xml)")
     add.add_argument("-o", "--output", type=Path, help="file to write (default: configs/scenes/NAME.yaml)")
     preview = actions.add_parser("preview", help="draw a contact sheet: a row per scene, random views of random states")
-    preview.add_argument("-o", "--output", type=Path, default=Path("preview.png"), help=_IMAGE.format("preview.png"))
+    preview.add_argument("-o", "--output", type=_picture, default="preview.png", help=_IMAGE.format("preview.png"))
     _add_views(preview, views=(4, _VIEWS), resolution=(256, _SIDE), spp=(64, "samples per pixel"))
 
 
@@ -328,8 +329,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
     show = actions.add_parser("show", help="draw the twelve components of a sample")
     show.add_argument("--split", choices=("val", "test"), default="test", help="of the sample (default: test)")
-    show.add_argument("--index", type=int, default=0, help="of the sample in its split (default: 0)")
-    show.add_argument("-o", "--output", default="sample.png", help=_IMAGE.format("sample.png"))
+    show.add_argument("--index", type=_whole, default=0, help="of the sample in its split (default: 0)")
+    show.add_argument("-o", "--output", type=_picture, default="sample.png", help=_IMAGE.format("sample.png"))
     verify = actions.add_parser("verify", help="read every byte and say all that is wrong")
     stats = actions.add_parser("stats", help="measure bytes and seconds by field, here and at the paper's scale")
     stats.add_argument("--workers", type=_positive, help="processes side by side (default: as many as cores)")
@@ -365,11 +366,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _spp(text: str) -> int | None:
-    if text == "equal":
-        return None
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be equal or a whole number of at least 0, is {text!r}")
-    return int(text)
+    return None if text == "equal" else _whole(text)
 
 
 def _experiment(text: str) -> str:
@@ -389,10 +386,19 @@ def _suite(text: str) -> str:
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, is {text}")
-    return value
+    return _whole(text, 1)
+
+
+def _whole(text: str, least: int = 0) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, is {text!r}")
+    return int(text)
+
+
+def _picture(text: str) -> Path:
+    if Path(text).suffix.lower() not in _PICTURES:
+        raise argparse.ArgumentTypeError(f"must end in one of {', '.join(_PICTURES)}, is {text!r}")
+    return Path(text)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def dashboard(directory: str, port: int) -> None:
     board.configure(logdir=str(logs), port=port, reload_interval=30)
     try:
         url = board.launch()
-    except program.TensorBoardServerException as error:
+    except (program.TensorBoardServerException, OverflowError) as error:  # above 65535
         raise UserError(f"--port {port}: {' '.join(str(error).split())}; give another one") from None
     print(f"{url} shows {directory}; Ctrl+C ends it", flush=True)
     try:

@@ -13,7 +13,7 @@ from nlt.errors import UserError
 from nlt.evaluation.figures import draw_sample
 
 
-def show_sample(place: str, split: str, index: int, output: str) -> str:
+def show_sample(place: str, split: str, index: int, output: Path) -> Path:
     """Draw sample `index` of an evaluated split and return the picture's path.
 
     Raises:
@@ -23,5 +23,5 @@ def show_sample(place: str, split: str, index: int, output: str) -> str:
     dataset = LightTransportDataset(directory, read_spec(directory), split)
     if not 0 <= index < len(dataset):
         raise UserError(f"{directory}: --index: {split} has samples 0 to {len(dataset) - 1}, not {index}")
-    draw_sample(Path(output), default_collate([dataset[index]]))
+    draw_sample(output, default_collate([dataset[index]]))
     return output
