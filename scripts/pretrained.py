@@ -28,8 +28,8 @@ def main(checkpoint: str, commit: str) -> None:
     begun, configs = origin(), [f"--config={file}" for file in CONFIGS]
     run = read_configs([str(Path(checkpoint).absolute().parents[1] / "config.yaml")])
     trainer = run_lightning(["test", *configs, f"--ckpt_path={checkpoint}", "--trainer.logger=false"]).trainer
-    method, spec = load_trained(checkpoint)
-    save_trained(method, spec, str(DEMO))
+    method, spec, points = load_trained(checkpoint)
+    save_trained(method, spec, points, str(DEMO))
     manifest = {
         **begun,
         "command": f"python scripts/pretrained.py {Path(checkpoint).name} {commit}",

@@ -1,6 +1,7 @@
 """Videos by a trained method: their frames are its predictions, none is made twice, and what is wrong is said."""
 
 import json
+import zlib
 from types import SimpleNamespace
 
 import av
@@ -12,13 +13,14 @@ from generated import spec_of
 from PIL import Image
 from tiny import write
 
+from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.photon_splat import PhotonSplat
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
-from nlt.data.store import points_name, write_shard
+from nlt.data.store import points_name, read_points, write_shard
 from nlt.evaluation.export import load_trained, save_trained
-from nlt.evaluation.render import DEMO, ModelRenderer, render, write_video
+from nlt.evaluation.render import DEMO, ModelRenderer, _with_scene, render, write_video
 from nlt.metrics.display import display
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy
@@ -46,7 +48,7 @@ def models(tmp_path_factory):
     methods = {"nlt": NeuralLightTransport(photons=True, num_points=200, **size), "splat": PhotonSplat(**size)}
     files = {name: folder / f"{name}.safetensors" for name in methods}
     for name, method in methods.items():
-        save_trained(method, spec_of(test=3), str(files[name]))
+        save_trained(method, spec_of(test=3), [], str(files[name]))
     return SimpleNamespace(**files)
 
 
@@ -68,7 +70,7 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light):
     # 7 are timed, the last of them in the first frame's state.
     assert len(cast) == len(transported) == (1 if light is None else 7 + 2)
 
-    method, spec = load_trained(str(models.nlt))
+    method, spec, _ = load_trained(str(models.nlt))
     renderer = SampleRenderer(spec, 0)
     views = cameras(renderer.description, "turntable", 3, *SIZE)
     moments = states(renderer.description, "moving_lights", "3", light, 3)
@@ -88,6 +90,26 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light):
         expected = [255 * display(x[None], exposure)[0].permute(1, 2, 0) for x in (predicted[k], traced[k])]
         picture = pixels(tmp_path / "frames" / f"{k:05d}.png")
         assert (picture[:12] == np.concatenate([e.round().numpy() for e in expected], 1)).all()
+
+
+def test_traces_only_the_pixels_that_the_method_looks_at():
+    method = SparseDenoising(one_in=16, width=2, depth=1)
+    model = ModelRenderer(method, spec_of(input_spp=64), 0, CPU)
+    description = model.render.description
+    (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
+    batch = model.batch(moment, view)
+    looked = method.mask(batch, SIZE[1], SIZE[0])[0, 0]
+    given = batch["noisy_input"][0]
+    assert looked.sum() == 12 and (given[:, ~looked] == 0).all()
+    whole = model.traced(moment, view, 1024, 0)[0]
+    noise = model.render.radiance(view, 64, 1) - whole.numpy()  # of as many samples, at all pixels
+    assert (given - whole)[:, looked].square().mean() < 20 * np.square(noise).mean()
+    assert given[:, looked].mean() == pytest.approx(whole[:, looked].mean().item(), rel=0.3)
+
+
+def test_without_embeddings_any_scene_will_do():
+    method = NeuralLightTransport(points=False, photons=True, width=2, depth=1)
+    assert _with_scene(method, spec_of(), "bedroom", "a.ckpt")[0].scenes == ["bedroom"]
 
 
 def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
@@ -114,6 +136,8 @@ def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
 def test_checkpoint_export_and_video(tiny, checkpoint, tmp_path, capsys):
     """A checkpoint and its export make the same frames; the mp4 shows them, the PNG is the first of them."""
     assert main(["export", str(checkpoint), "-o", "small.safetensors"]) == 0
+    points = read_points(tiny.dataset / points_name(0))["position"].tobytes()
+    assert load_trained(str(checkpoint))[2] == load_trained("small.safetensors")[2] == [zlib.crc32(points)]
     size = ["--frames", "3", "--resolution", "34x17", "--state", "2", "--spp", "1"]
     for model, output in ((checkpoint, "a"), ("small.safetensors", "b")):
         assert main(["render", str(model), "living_room", "-o", output, *size]) == 0
@@ -151,7 +175,7 @@ def test_demo(tmp_path):
     assert manifest["command"] and len(manifest["commit"]) == 40 and manifest["test"]["mse"] > 0
     assert main(["render", "--demo", "--frames", "2", "--resolution", "32", "-o", "demo.mp4"]) == 0
     assert pixels(tmp_path / "demo.png").shape == (52, 64, 3) and (tmp_path / "demo.mp4").stat().st_size > 0
-    method, spec = load_trained(str(DEMO))
+    method, spec, _ = load_trained(str(DEMO))
     model = ModelRenderer(method, spec, 0, CPU)
     errors = []
     moments = states(spec.descriptions[0], "moving_lights", "5", "turntable", 4)
@@ -214,7 +238,8 @@ def test_files_of_states_and_views(demo, tmp_path):
 def test_mistakes_are_one_line(models, tmp_path, refused):
     view = {"position": [0, 1, 0], "target": [1, 1, 0]}
     file = lambda name, content: str(write(tmp_path / name, content))
-    plain = ["render", models.splat, "living_room", "--resolution", "8", "--frames", "1"]
+    tiny = ["--resolution", "8", "--frames", "1"]
+    plain = ["render", models.splat, "living_room", *tiny]
     refused(["render", "nowhere.ckpt", "living_room"], "nowhere.ckpt", "cannot be read")
     refused(["render", "nowhere.safetensors", "living_room"], "nowhere.safetensors", "cannot be read")
     broken = tmp_path / "broken.safetensors"
@@ -222,9 +247,11 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     refused(["render", broken, "living_room"], broken, "damaged")
     refused(["render", models.splat, "palace"], "palace", "known scenes")
     refused(["render", models.nlt, "bedroom"], "bedroom", "embeddings", "living_room")
-    method, _ = load_trained(str(models.nlt))
-    save_trained(method, spec_of(points=300), "more.safetensors")
+    method, *_ = load_trained(str(models.nlt))
+    save_trained(method, spec_of(points=300), [], "more.safetensors")
     refused(["render", "more.safetensors", "living_room"], "200 points", "300")
+    save_trained(method, spec_of(), [0], "other.safetensors")
+    refused(["render", "other.safetensors", "living_room", *tiny, "-o", "other"], "other.safetensors", "other points")
     refused(["render", models.splat], "CKPT and SCENE")
     refused(["render", "--demo", models.splat, "living_room"], "CKPT and SCENE")
     refused([*plain, "-o", "video.avi"], "video.avi")
@@ -236,6 +263,8 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
         ({"views": [{**view, "up": 1}]}, ["views[0].up", "unknown"]),
         ({"views": [{**view, "target": [0, 1]}]}, ["views[0].target", "shape 3"]),
         ({"views": [{**view, "target": view["position"]}]}, ["frame 0"]),
+        ({"views": [view], "fov": 200}, ["fov", "below 180"]),
+        ({"views": [view], "closed": "no"}, ["closed", "true or false"]),
         ("views: [", ["not valid YAML"]),
     ):
         path = file("path.yaml", content if isinstance(content, str) else yaml.safe_dump(content))
@@ -248,6 +277,6 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     ):
         refused([*plain, "--state", file("state.yaml", state)], "state.yaml", *words)
     fixed = tmp_path / "fixed.safetensors"
-    save_trained(PhotonSplat(width=2, depth=1), spec_of(experiment="fixed_lights"), str(fixed))
+    save_trained(PhotonSplat(width=2, depth=1), spec_of(experiment="fixed_lights"), [], str(fixed))
     refused(["render", fixed, "living_room", "--light", "turntable"], "--light", "fixed_lights")
     assert not list(tmp_path.glob("video*"))

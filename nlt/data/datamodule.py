@@ -15,7 +15,7 @@ from nlt.data.engines import cores
 from nlt.data.files import AnyPath
 from nlt.data.loader import ThreadLoader
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import check_dataset
+from nlt.data.store import check_dataset, points_crc, points_name, read_points
 from nlt.errors import UserError
 
 
@@ -57,6 +57,7 @@ class LightTransportDataModule(L.LightningDataModule):
         self.online, self.passes, self.train_images = online, 0, train_images
         self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
+        self.points: list[int] = []
 
     def next_pass(self) -> int:
         """Which pass over the online samples begins; each comes once."""
@@ -64,8 +65,9 @@ class LightTransportDataModule(L.LightningDataModule):
         return self.passes - 1
 
     def state_dict(self) -> dict[str, Any]:
-        """For checkpoints: how many passes over online samples were begun; a resumed run goes on behind them."""
-        return {"passes": self.passes} if self.online else {}
+        """For checkpoints: of which points the embeddings are, a CRC of each scene's; how many passes over online
+        samples were begun, behind which a resumed run goes on."""
+        return {"points": self.points, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on where a checkpoint's run was."""
@@ -91,6 +93,7 @@ class LightTransportDataModule(L.LightningDataModule):
             directory = self.stored.directory(self.root)
             check_dataset(directory, self.stored)
             self.directory = directory
+            self.points = [points_crc(read_points(directory / points_name(k))) for k in range(self.num_scenes)]
 
     def split(self, name: str) -> LightTransportDataset:
         """The dataset of a split, with the fields that the trainer's method needs; all without a trainer."""

@@ -109,14 +109,14 @@ class SampleRenderer:
             for name, field in fields.items()
         }
 
-    def radiance(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
-        """Path-traced radiance (3, H, W).
+    def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
+        """Path-traced radiance (3, H, W), or (3, n) of `pixels` (n,), flat indices.
 
         Raises:
             UserError: it is not finite, three times.
         """
         for attempt in range(_TRIES):
-            image = self.renderer.radiance(camera, spp, (seed + attempt) % 2**32)
+            image = self.renderer.radiance(camera, spp, (seed + attempt) % 2**32, pixels)
             if np.isfinite(image).all():
                 return image
         raise UserError(f"{self.description.source}: the path tracer gives non-finite radiance at seed {seed}")

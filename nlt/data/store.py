@@ -100,6 +100,11 @@ def read_points(path: AnyPath) -> Points:
     return ShardReader().read(path, 0, POINT_FIELDS)
 
 
+def points_crc(points: Points) -> int:
+    """Equal for the same points in the same order, which is what learned embeddings are of."""
+    return zlib.crc32(points["position"].tobytes())
+
+
 def points_name(scene: int) -> str:
     """The file with a scene's points, relative to the dataset's directory."""
     return f"points-{scene:03d}.safetensors"

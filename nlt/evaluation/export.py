@@ -13,13 +13,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.files import write_bytes
 from nlt.data.sample import BATCH_FIELDS, FIELDS
 from nlt.data.spec import DatasetSpec, read_configs
 from nlt.errors import UserError
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
-from nlt.training import load_method
+from nlt.training import load_method, read_checkpoint
 
 SAFETENSORS = ".safetensors"
 
@@ -63,16 +64,23 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
     write_bytes(Path(output), file.getvalue())
 
 
-def save_trained(method: RenderingModule, spec: DatasetSpec, output: str) -> None:
-    """Write a method and what it was trained on as safetensors, for `load_trained`."""
+def save_trained(method: RenderingModule, spec: DatasetSpec, points: list[int], output: str) -> None:
+    """Write a method and what it was trained on as safetensors, as `load_trained` returns it."""
     settings = {key: value for key, value in method.hparams.items() if not key.startswith("_")}
-    about = {"method": method.class_path(), "init_args": settings, "dataset": dataclasses.asdict(spec)}
+    about = {
+        "method": method.class_path(),
+        "init_args": settings,
+        "dataset": dataclasses.asdict(spec),
+        "points": points,
+    }
     weights = {name: tensor.contiguous() for name, tensor in method.state_dict().items()}
     write_bytes(Path(output), save(weights, {"nlt": json.dumps(about)}))
 
 
-def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec]:
-    """A trained method, and the dataset that it was trained on: of a checkpoint within its run, or of safetensors.
+def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
+    """A trained method, of a checkpoint within its run or of safetensors, and the dataset that it was trained on.
+
+    Last the `points_crc` of each of its scenes; none of a file from before they were kept.
 
     Raises:
         UserError: it cannot be read, or is none.
@@ -81,7 +89,11 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec]:
         method, config = load_method(path, "CKPT"), Path(path).absolute().parents[1] / "config.yaml"
         if not config.exists():
             raise UserError(f"CKPT: {path}: {config} is missing, which says of what data; leave it in its run")
-        return method, DatasetSpec(**read_configs([str(config)])["data"]["dataset"])
+        try:
+            spec = DatasetSpec(**read_configs([str(config)])["data"]["dataset"])
+        except (LookupError, TypeError):
+            raise UserError(f"CKPT: {path}: {config} says of no data; leave the checkpoint in its run") from None
+        return method, spec, read_checkpoint(path).get(LightTransportDataModule.__qualname__, {}).get("points", [])
     try:
         with safe_open(path, "pt") as file:
             about = json.loads(file.metadata()["nlt"])
@@ -90,7 +102,7 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec]:
         assert isinstance(kind, type) and issubclass(kind, RenderingModule)
         method = kind(**about["init_args"])
         method.load_state_dict(weights)
-        return method, DatasetSpec(**about["dataset"])
+        return method, DatasetSpec(**about["dataset"]), about.get("points", [])
     except OSError as error:
         raise UserError(f"CKPT: {path}: cannot be read: {error.strerror or error}") from None
     except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, AssertionError):

@@ -25,7 +25,7 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import points_name, read_points
+from nlt.data.store import Points, points_crc, points_name, read_points
 from nlt.errors import UserError
 from nlt.evaluation.export import load_trained
 from nlt.evaluation.provenance import origin, surroundings
@@ -34,6 +34,7 @@ from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, default_device
+from nlt.models.transport import PointEmbedding
 from nlt.paths import find_config
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
@@ -42,12 +43,12 @@ from nlt.scenes.trajectory import cameras, states
 
 DEMO = Path(__file__).with_name("pretrained") / "living_room.safetensors"
 MANIFEST = "render.json"
+_DATASETS = "datasets"  # where they are looked for
 _MODEL, _TRACED = 0, 1  # seeds
 _WARM, _TIMED = 2, 5  # frames: the first compile kernels
 _FEW, _MANY = 1, 8  # samples per pixel, between which the cost of one is measured
 _MOST_SPP = 4096
 _CAPTION = 20  # pixels
-_TARGETS = ("noisy", "noisy_input", "reference_a", "reference_b")
 
 
 class ModelRenderer(LightTransportDataset):
@@ -68,17 +69,20 @@ class ModelRenderer(LightTransportDataset):
         self._key: bytes | None = None
         self._of_state = {name for name in method.inputs if name.startswith("photon_")}
         if any(name.startswith("point_") for name in method.inputs):
-            self._hold([self._cloud()] * (scene + 1))
+            self.points = self._cloud()
+            self._hold([self.points] * (scene + 1))
             self._of_state |= {"translation", "present"}
 
-    def _cloud(self) -> dict[str, np.ndarray]:
+    def _cloud(self) -> Points:
         """The points of training, whose embeddings are learned row by row: the dataset's own where it is here."""
-        stored = self.spec.directory("datasets") / points_name(self.scene)
+        stored = self.spec.directory(_DATASETS) / points_name(self.scene)
         return read_points(stored) if stored.exists() else self.render.points()
 
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """What the method reads of a frame, as a batch of one."""
         images = {name for name in self.method.inputs if name in ("depth", "normal", "albedo", "noisy_input")}
+        few = self.method.pixel_fraction < 1
+        images -= {"noisy_input"} if few else set()
         self._enter(state)
         if state.key != self._key:
             self._state = self.render.view(camera, self._seeds, self._of_state)
@@ -86,10 +90,19 @@ class ModelRenderer(LightTransportDataset):
         view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
         tensors = self._tensors(self.scene, self._state | view, 0)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
-        return {
+        batch = {
             name: (value.float() if value.dtype == torch.float16 else value)[None].to(self.device)
             for name, value in tensors.items()
         }
+        return batch | {"noisy_input": self._few_pixels(batch, camera)} if few else batch
+
+    def _few_pixels(self, batch: Batch, camera: Camera) -> Tensor:
+        """(1, 3, H, W): radiance of the pixels that the method looks at, which alone are traced; 0 elsewhere."""
+        mask = self.method.mask(batch, camera.height, camera.width)[0, 0].cpu().numpy()
+        image = np.zeros((3, *mask.shape), np.float32)
+        seed = int(self._seeds.generate_state(1)[0])
+        image[:, mask] = self.render.radiance(camera, self.spec.input_spp, seed, np.flatnonzero(mask))
+        return torch.from_numpy(image)[None].to(self.device)
 
     def _enter(self, state: SceneState) -> None:
         if state.key != self.render.scene.state.key:
@@ -140,7 +153,7 @@ def render(
     if not video and Path(output).suffix:
         raise UserError(f"-o: must be NAME.mp4 or a folder for PNGs, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
-    method, spec = load_trained(checkpoint)
+    method, spec, points = load_trained(checkpoint)
     spec, index = _with_scene(method, spec, scene, checkpoint)
     spec = dataclasses.replace(spec, photons=photons or spec.photons)
     description = spec.descriptions[index]
@@ -160,6 +173,11 @@ def render(
         device = default_device()
         policy = Policy.for_device(device)
         model = ModelRenderer(method, spec, index, device)
+        if _embeds(method) and points and points_crc(model.points) != points[index]:
+            raise UserError(
+                f"CKPT: {checkpoint}: has embeddings of other points than there are here, as with another NLT_VARIANT; "
+                f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
+            )
         with torch.no_grad(), policy.applied(device):
             if not known:
                 timed = _measure(model, moments, views, spp)
@@ -186,7 +204,7 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     """The dataset's spec with the scene, and which it is."""
     files = [find_config("scenes", name).resolve() for name in spec.scenes]
     file = find_config("scenes", scene).resolve()
-    embeds = "num_points" in method.architecture
+    embeds = _embeds(method)
     if embeds:
         points = min(spec.points, method.hparams["max_points"] or spec.points)
         if (method.hparams["num_scenes"], method.hparams["num_points"]) != (len(files), points):
@@ -203,6 +221,10 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
             "name one of these, or train on this scene"
         )
     return dataclasses.replace(spec, scenes=[scene]), 0
+
+
+def _embeds(method: RenderingModule) -> bool:
+    return any(isinstance(part, PointEmbedding) for part in method.modules())
 
 
 def _digest(*parts: bytes) -> str:

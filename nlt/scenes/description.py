@@ -149,6 +149,20 @@ class Section:
             raise UserError(f"{self.file}: {self.field(key)}: must be above zero, is {array.tolist()}")
         return array
 
+    def degrees(self, key: str, default: float) -> float:
+        """A field of view."""
+        angle = float(self.positive(key, default=default))
+        if angle >= 180:
+            raise UserError(f"{self.file}: {self.field(key)}: must be below 180 degrees, is {angle:g}")
+        return angle
+
+    def flag(self, key: str) -> bool:
+        """False where it is not given."""
+        value = self.get(key, False)
+        if not isinstance(value, bool):
+            raise UserError(f"{self.file}: {self.field(key)}: must be true or false, is {value!r}")
+        return value
+
     def box(self, key: str) -> np.ndarray:
         box = self.numbers(key, (2, 3))
         if (box[0] > box[1]).any():
@@ -186,9 +200,6 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     up = top.get("up", "y")
     if up not in UP:
         raise UserError(f"{file}: up: must be one of {', '.join(UP)}, is {up!r}")
-    fov = float(top.positive("fov", default=70.0))
-    if fov >= 180:
-        raise UserError(f"{file}: fov: must be below 180 degrees, is {fov:g}")
     camera = top.min_max("camera") * scale
     half = camera.mean(0) + (camera - camera.mean(0)) / 2
     teacher = top.get("teacher", "path")
@@ -221,7 +232,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
         units_per_metre=1.0 / scale,
         up=np.array(UP[up]),
         exposure=float(top.positive("exposure", default=1.0)),
-        fov=fov,
+        fov=top.degrees("fov", default=70.0),
         camera=camera,
         look_at=top.min_max("look_at") * scale if "look_at" in data else half,
         objects=tuple(objects),

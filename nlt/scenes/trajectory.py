@@ -56,13 +56,13 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
         targets = turn(description.look_at, description.up, frames, phase=0.5)
     else:
         section = _read(path, ("views", "closed", "fov"))
-        views, closed = section.get("views"), section.get("closed", False)
+        views, closed = section.get("views"), section.flag("closed")
         if not isinstance(views, list) or not views:
             raise UserError(f"{path}: views: must be a list of a position and a target each, is {views!r}")
         keys = [Section(Path(path), f"views[{k}]", view, ("position", "target")) for k, view in enumerate(views)]
         ends = ("position", "target")
         positions, targets = (follow(np.stack([k.numbers(end, (3,)) for k in keys]), frames, closed) for end in ends)
-        fov = float(section.positive("fov", default=fov))
+        fov = section.degrees("fov", default=fov)
     for k, (position, target) in enumerate(zip(positions, targets, strict=True)):
         away = target - position
         if np.linalg.norm(np.cross(away, description.up)) <= 1e-3 * np.linalg.norm(away):
@@ -130,7 +130,7 @@ def _read_state(
     if keys is not None:
         count = len(keys) if isinstance(keys, list) else 0
         keys = section.numbers("light", (max(count, 1), 3))
-    return base, keys, bool(section.get("closed", False))
+    return base, keys, section.flag("closed")
 
 
 def _read(path: str, known: tuple[str, ...]) -> Section:
