@@ -64,7 +64,9 @@ def draw_learning_curves(results: Results) -> None:
 def _label(axis: matplotlib.axis.Axis) -> None:
     """A logarithmic axis, at places whose numbers do not run into each other."""
     low, high = axis.get_data_interval()
-    axis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,)))
+    subs = (1, 2, 5) if high < 30 * low else (1,)
+    few = matplotlib.ticker.MaxNLocator(4)  # where powers have one number or none
+    axis.set_major_locator(few if high < 5 * low else matplotlib.ticker.LogLocator(subs=subs))
     axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axis.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
