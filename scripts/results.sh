@@ -16,3 +16,5 @@ publish --config static_kitchen
 publish --config static_bathroom
 publish --config table2 --data dynamic_moving_lights
 publish --config table1 --data dynamic_fixed_lights
+nlt stress --config table2 --scale "$scale"
+[ "$scale" != small ] || { python benchmarks/leaner.py --seeds 2; python benchmarks/selection.py; }

@@ -1,7 +1,8 @@
 """Copies what the documentation shows out of results/ and the code: `python scripts/update_readme.py`.
 
 A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
-(`results/NAME/table.md`), what the stress suites say (`results/NAME/stress/stress.md`), a group of fields
+(`results/NAME/table.md`), what the stress suites (`results/NAME/stress/stress.md`) or the study of sizes
+(`results/leaner/leanest.md`) say, a group of fields
 (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
 """
 
@@ -22,13 +23,13 @@ def content(source: str) -> str:
         return field_table(getattr(sample, name))
     if path == "scripts/paper_scale.py":
         return str(runpy.run_path(str(PROJECT / path))["tables"](PROJECT / "results/bench/target"))
-    return body(PROJECT / path) if path.endswith("/stress.md") else first_table(PROJECT / path)
+    return body(PROJECT / path) if path.endswith(("/stress.md", "/leanest.md")) else first_table(PROJECT / path)
 
 
 def body(path: Path) -> str:
     """A Markdown file without its title, a level lower; what makes it, where it is not there."""
     if not path.exists():
-        return f"Not measured yet: `nlt stress --config {path.parts[-3]}`, then `python scripts/update_readme.py`."
+        return f"Not measured yet: there is no {path.relative_to(PROJECT)}."
     return re.sub(r"^#", "##", path.read_text().partition("\n")[2].strip(), flags=re.MULTILINE)
 
 
