@@ -2,8 +2,7 @@
 
 A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
 (`results/NAME/table.md`), what the stress suites (`results/NAME/stress/stress.md`) or the study of sizes
-(`results/leaner/leanest.md`) say, a group of fields
-(`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
+(`results/leaner/leanest.md`) say, a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
 """
 
 import re
@@ -27,7 +26,7 @@ def content(source: str) -> str:
 
 
 def body(path: Path) -> str:
-    """A Markdown file without its title, a level lower; what makes it, where it is not there."""
+    """A Markdown file without its title, a level lower; that it is not there, where it is not."""
     if not path.exists():
         return f"Not measured yet: there is no {path.relative_to(PROJECT)}."
     return re.sub(r"^#", "##", path.read_text().partition("\n")[2].strip(), flags=re.MULTILINE)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nlt.models import plain
-from nlt.models.projection import project, project_sparse, visible_pixels
+from nlt.models.projection import average_sparsely, project, visible_pixels
 
 H, W = 12, 16
 
@@ -187,4 +187,5 @@ def test_bfloat16_features_count_beyond_256():
         torch.zeros(1, 3, H, W),
     )  # fmt: skip
     assert project(*scene)[0, 0, 0, 0] == 1
-    assert [part.tolist() for part in project_sparse(*scene)] == [[[1.0]], [0]]
+    sparse = average_sparsely(scene[0], visible_pixels(*scene[1:]), H, W)
+    assert [part.tolist() for part in sparse] == [[[1.0]], [0]]

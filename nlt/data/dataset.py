@@ -68,7 +68,7 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
         """A batch, for `torch.utils.data.DataLoader` with `collated`: every value is copied once, to where it stays."""
         samples = [self._tensors(*self._sample(index), index) for index in indices]
-        return {name: _stack([sample[name] for sample in samples]) for name in samples[0]}
+        return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         """The scene of a sample, and what is stored of it."""
@@ -114,7 +114,7 @@ def collated(batch: Any) -> Any:
     return batch
 
 
-def _stack(tensors: list[Tensor]) -> Tensor:
+def stack(tensors: list[Tensor]) -> Tensor:
     """As torch.stack, halves as float32; what all samples share, the static points of one scene, is not copied."""
     dtype = tensors[0].dtype
     if dtype != torch.float16 and all(tensor is tensors[0] for tensor in tensors):

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import LightTransportDataset
+from nlt.data.dataset import LightTransportDataset, stack
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
@@ -90,10 +90,7 @@ class ModelRenderer(LightTransportDataset):
         view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
         tensors = self._tensors(self.scene, self._state | view, 0)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
-        batch = {
-            name: (value.float() if value.dtype == torch.float16 else value)[None].to(self.device)
-            for name, value in tensors.items()
-        }
+        batch = {name: stack([value]).to(self.device) for name, value in tensors.items()}
         return batch | {"noisy_input": self._few_pixels(batch, camera)} if few else batch
 
     def _few_pixels(self, batch: Batch, camera: Camera) -> Tensor:

@@ -18,7 +18,7 @@ from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
 from nlt.models.method import Batch, Method
 from nlt.models.policy import project_sparsely
-from nlt.models.projection import SparseMap, project, project_sparse
+from nlt.models.projection import SparseMap, average_sparsely, project, visible_pixels
 from nlt.models.unet import UNet
 
 # The names in a batch that the two shared inputs read.
@@ -146,8 +146,9 @@ class RenderingModule(Method, L.LightningModule):
         """The G-buffer and behind it each cloud's own map; a mean over all would mix their kinds of feature."""
         gbuffer = self.gbuffer(batch)
         if project_sparsely(max((len(valid[0]) for *_, valid in clouds), default=0), gbuffer[0, 0].numel()):
-            view = {name: batch[name] for name in PROJECTION}
-            return gbuffer, [project_sparse(*cloud, **view) for cloud in clouds]
+            view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
+            found = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
+            return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in found]
         return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds)])
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:

@@ -108,6 +108,16 @@ def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor
     return total(features, pixels, height, width).div_(count.clamp(min=1))
 
 
+def average_sparsely(features: Tensor, pixels: Tensor, height: int, width: int) -> SparseMap:
+    """As `average`: a row for each pixel in which a point is visible."""
+    visible = pixels < height * width
+    at = (pixels + height * width * torch.arange(len(pixels), device=pixels.device)[:, None])[visible]
+    seen, row, count = at.unique(return_inverse=True, return_counts=True)
+    features = features[visible].to(torch.promote_types(features.dtype, torch.float32))  # as in `total`
+    sums = features.new_zeros(len(seen), features.shape[1]).index_add_(0, row, features)
+    return SparseMap(sums / count[:, None], seen)
+
+
 def project(
     features: Tensor,
     positions: Tensor,
@@ -124,22 +134,3 @@ def project(
     """
     pixels = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal, epsilon)
     return average(features, pixels, *depth.shape[-2:])
-
-
-def project_sparse(
-    features: Tensor,
-    positions: Tensor,
-    valid: Tensor,
-    camera_matrix: Tensor,
-    world_to_view: Tensor,
-    depth: Tensor,
-    normal: Tensor,
-) -> SparseMap:
-    """As `project`: a row for each pixel in which a point is visible."""
-    pixels, size = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal), depth[0].numel()
-    visible = pixels < size
-    at = (pixels + size * torch.arange(len(depth), device=depth.device)[:, None])[visible]
-    seen, row, count = at.unique(return_inverse=True, return_counts=True)
-    features = features[visible].to(torch.promote_types(features.dtype, torch.float32))  # as in `total`
-    sums = features.new_zeros(len(seen), features.shape[1]).index_add_(0, row, features)
-    return SparseMap(sums / count[:, None], seen)
