@@ -343,6 +343,25 @@ def test_end_to_end(ladder, tiny, monkeypatch, capsys):
     assert run_select(ladder, out="killed") == rows
 
 
+@pytest.mark.parametrize("lights", [(), ("lamp",)])
+def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
+    """Though the CNN is the slowest and the worst, where nothing moves one of it is trained as long as the full model."""
+    FakeTime(monkeypatch)
+    monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
+    score, race = search.Search.score, clock.Clock.race
+    worse = lambda this, run, split: {k: [v + 9 * ("cnn" in str(run)) * (-1) ** (k == "mssim") for v in values]
+                                      for k, values in score(this, run, split).items()}  # fmt: skip
+    slower = lambda this, modules, budget: {
+        name: [{stage: t * (100 if "cnn" in name else 1) for stage, t in lap.items()} for lap in laps]
+        for name, laps in race(this, modules, budget).items()
+    }
+    monkeypatch.setattr(search.Search, "score", worse)
+    monkeypatch.setattr(clock.Clock, "race", slower)
+    finals = [row for row in run_select(ladder) if row["steps"] == str(STEPS)]
+    assert len(finals) == 3 and any(row["full"] == "1" for row in finals)
+    assert sum(row["method"] == "cnn" for row in finals) == (0 if lights else 1)
+
+
 def newest(folder):
     return max(path.stat().st_mtime for path in folder.rglob("*.ckpt"))
 

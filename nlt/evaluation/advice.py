@@ -46,11 +46,12 @@ class Facts:
 
 @dataclass(frozen=True)
 class Advice:
-    """One answer: what a model needs of `subject`, and why."""
+    """One answer: what a model needs of `subject`, and why; the `methods` that have no more, where it names any."""
 
     subject: str
     verdict: str
     reason: str
+    methods: tuple[str, ...] = ()
 
 
 def measure_facts(spec: DatasetSpec, views: int = _VIEWS) -> list[Facts]:
@@ -130,13 +131,15 @@ def _transport(facts: list[Facts]) -> Advice:
     lights = [name for fact in facts for name in fact.moving_lights]
     moving = [name for fact in facts for name in fact.moving]
     if lights:
+        kind, methods = "photons", ("nlt_photons", "photon_splat")
         reason = f"lights move or are removed: {_some(lights)}; photons say where light arrives in each state"
-        return Advice("light transport", "photons: nlt_photons, photon_splat", reason)
-    if moving:
+    elif moving:
+        kind, methods = "points", ("nlt",)
         reason = f"objects move or are removed: {_some(moving)}; no light does, so where it arrives is learned"
-        return Advice("light transport", "points: nlt", reason)
-    reason = "nothing moves: what leaves a point is always the same, and a learned feature of the point holds it"
-    return Advice("light transport", "none: feature_projection, ablation", reason)
+    else:
+        kind, methods = "none", ("feature_projection", "cnn")
+        reason = "nothing moves: what leaves a point is always the same; a feature of the point, or the U-Net, holds it"
+    return Advice("light transport", f"{kind}: {', '.join(methods)}", reason, methods)
 
 
 def _view_direction(facts: list[Facts]) -> Advice:

@@ -35,7 +35,7 @@ from nlt.training import newest_checkpoint, read_checkpoint
 SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
 _ETA, _RUNGS = 3, 3  # one in three goes on, at most so often
 _LEAST = 3  # candidates in the last rung
-_ENOUGH = 6  # candidates: below these, rather fewer steps
+_ENOUGH = 10  # candidates: below these, rather fewer steps
 _TIMING = 0.1  # of the budget, at most, for the times per step, and as much for those per frame
 _SETUP = 3.0  # seconds a training takes beside its steps, about
 _RECENT = 5  # trainings, by which the estimates are corrected
@@ -58,10 +58,13 @@ class Entry:
 class Search:
     """Trains a ladder's candidates, the worse of them for a short time only.
 
+    The full model and the best candidate of each method in `advised` go to the end: a method that has to learn what
+    others are given, such as where light arrives in a scene in which nothing moves, is behind them at first.
     Every decision follows from what lies in `directory`: killed and started again, the search goes on and ends alike.
     """
 
-    def __init__(self, ladder: Ladder, dataset: Any, root: Path) -> None:
+    def __init__(self, ladder: Ladder, dataset: Any, root: Path, advised: Sequence[str] = ()) -> None:
+        self.advised = advised
         self.ladder, self.dataset, self.budget = ladder, dataset, 60.0 * ladder.minutes
         decides = [ladder.config(candidate) for candidate in ladder.candidates]
         self.device = default_device()
@@ -241,10 +244,11 @@ class Search:
         return finals
 
     def _order(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Those worth going on with first; the full model is always the first."""
+        """Those worth going on with first: the full model, the best of each advised method, the others."""
         times = {c: float(self.entries[c].cost["time_per_frame_s"]) for c in candidates}
         order = ranked([self.errors(candidates, key) for key in SCORES], times)
-        return sorted(order, key=lambda c: c != self.ladder.full)
+        advised = {c.method: c for c in reversed(order) if c.method in self.advised}.values()
+        return sorted(order, key=lambda c: 0 if c == self.ladder.full else 1 if c in advised else 2)
 
     def train(self, candidate: Candidate, seed: int, steps: int, begun: int) -> bool:
         """Train on from `begun` to `steps` and score on the validation split; False if it diverges."""

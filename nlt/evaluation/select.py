@@ -44,7 +44,8 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     directory = Path(out or Path("results/select") / ladder.name)
     write_bytes(directory / "advice.md", advice.table(advised, facts).encode())
     dataset = generate(ladder.spec, ladder.root)
-    search = Search(ladder, dataset, Path("runs") / dataset.name / "select")
+    methods = [method for each in advised for method in each.methods]
+    search = Search(ladder, dataset, Path("runs") / dataset.name / "select", methods)
     finals = search.run()
     times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
     parameters = {c: float(search.entries[c].cost["parameters"]) for c in finals}
