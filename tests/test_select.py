@@ -345,7 +345,7 @@ def test_end_to_end(ladder, tiny, monkeypatch, capsys):
 
 @pytest.mark.parametrize("lights", [(), ("lamp",)])
 def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
-    """Though the CNN is the slowest and the worst, where nothing moves one of it is trained as long as the full model."""
+    """Where nothing moves, a CNN is among those trained longest, though it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
     score, race = search.Search.score, clock.Clock.race

@@ -130,6 +130,7 @@ def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
 def _transport(facts: list[Facts]) -> Advice:
     lights = [name for fact in facts for name in fact.moving_lights]
     moving = [name for fact in facts for name in fact.moving]
+    methods: tuple[str, ...]
     if lights:
         kind, methods = "photons", ("nlt_photons", "photon_splat")
         reason = f"lights move or are removed: {_some(lights)}; photons say where light arrives in each state"
