@@ -21,7 +21,7 @@ from nlt.baselines.feature_projection import FeatureProjection
 from nlt.cli import main
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import advice, clock, search
+from nlt.evaluation import advice, clock, search, trials
 from nlt.evaluation.choice import choose, paired_difference, ranked, within
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
@@ -237,7 +237,7 @@ class FakeTime:
 
     def __init__(self, patch, per_step=1.0, setup=2.0):
         self.seconds, self.per_step, self.setup, self.begun, self.die = 0.0, per_step, setup, [], math.inf
-        original = search.Search._fit
+        original = trials.Trials._fit
 
         def fit(this, run, candidate, seed, steps):
             self.begun.append((candidate.name, seed, steps, self.seconds))
@@ -249,8 +249,9 @@ class FakeTime:
             self.seconds += self.setup + done * self.per_step * width
             return done
 
-        patch.setattr(search, "now", lambda: self.seconds)
-        patch.setattr(search.Search, "_fit", fit)
+        for module in (search, trials):
+            patch.setattr(module, "now", lambda: self.seconds)
+        patch.setattr(trials.Trials, "_fit", fit)
         patch.setattr(search.Search, "_step_s", lambda this, module: self.per_step * module.hparams["width"])
 
 
@@ -348,14 +349,16 @@ def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
     """Where nothing moves, a CNN is among those trained longest, though it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
-    score, race = search.Search.score, clock.Clock.race
-    worse = lambda this, run, split: {k: [v + 9 * ("cnn" in str(run)) * (-1) ** (k == "mssim") for v in values]
-                                      for k, values in score(this, run, split).items()}  # fmt: skip
+    score, race = trials.Trials.score, clock.Clock.race
+    worse = lambda this, candidate, *how: {
+        key: [value + 9 * (candidate.method == "cnn") * (-1) ** (key == "mssim") for value in values]
+        for key, values in score(this, candidate, *how).items()
+    }
     slower = lambda this, modules, budget: {
         name: [{stage: t * (100 if "cnn" in name else 1) for stage, t in lap.items()} for lap in laps]
         for name, laps in race(this, modules, budget).items()
     }
-    monkeypatch.setattr(search.Search, "score", worse)
+    monkeypatch.setattr(trials.Trials, "score", worse)
     monkeypatch.setattr(clock.Clock, "race", slower)
     finals = [row for row in run_select(ladder) if row["steps"] == str(STEPS)]
     assert len(finals) == 3 and any(row["full"] == "1" for row in finals)

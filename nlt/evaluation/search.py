@@ -13,36 +13,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-import yaml
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import default_collate
 
-from nlt import training
-from nlt.data.dataset import LightTransportDataset, collated
 from nlt.data.files import write_bytes
-from nlt.data.spec import merge
-from nlt.errors import DivergedError, UserError
+from nlt.errors import UserError
 from nlt.evaluation.choice import ranked
 from nlt.evaluation.clock import Clock, summary
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.ladder import Candidate, Ladder
-from nlt.metrics.image_metrics import ImageMetrics
-from nlt.metrics.quantities import METRICS
+from nlt.evaluation.trials import SCORES, Trials, as_error
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
-from nlt.training import newest_checkpoint, read_checkpoint
 
-SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
 _ETA, _RUNGS = 3, 3  # one in three goes on, at most so often
 _LEAST = 3  # candidates in the last rung
 _ENOUGH = 10  # candidates: below these, rather fewer steps
 _TIMING = 0.1  # of the budget, at most, for the times per step, and as much for those per frame
 _SETUP = 3.0  # seconds a training takes beside its steps, about
 _RECENT = 5  # trainings, by which the estimates are corrected
-_BATCH = 16
 
 now = time.perf_counter
-Scores = dict[str, list[float]]  # of every image, by the keys of SCORES
 
 
 @dataclass
@@ -64,13 +54,13 @@ class Search:
     """
 
     def __init__(self, ladder: Ladder, dataset: Any, root: Path, advised: Sequence[str] = ()) -> None:
-        self.advised = advised
-        self.ladder, self.dataset, self.budget = ladder, dataset, 60.0 * ladder.minutes
-        decides = [ladder.config(candidate) for candidate in ladder.candidates]
+        self.ladder, self.advised, self.budget = ladder, advised, 60.0 * ladder.minutes
         self.device = default_device()
         self.policy = Policy.for_device(self.device)
+        decides = [ladder.config(candidate) for candidate in ladder.candidates]
         key = json.dumps([decides, self.policy.precision, ladder.minutes, ladder.seeds], sort_keys=True)
         self.directory = root / f"{ladder.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        self.trials = Trials(ladder, dataset, self.directory, self.device, self.policy)
         self.spent = 0.0
         self.entries: dict[Candidate, Entry] = {}
         self.seeds = [0]
@@ -122,7 +112,7 @@ class Search:
         if not self._fits(order, 2, rungs):
             minutes = math.ceil(2 * (self.spent + self._cost(order[:2], rungs)) / 60)
             raise UserError(f"--minutes: {self.ladder.minutes:g} are too few for two candidates; give {minutes}")
-        clock = Clock(Frames(self._split("val")), self.device)
+        clock = Clock(Frames(self.trials.split("val")), self.device)
         laps = clock.race({c.slug: modules[c] for c in self.entries}, _TIMING * self.budget)
         for entry in self.entries.values():
             entry.cost |= summary(laps[entry.candidate.slug]) | clock.size(modules[entry.candidate])
@@ -140,7 +130,7 @@ class Search:
 
     def _step_s(self, module: RenderingModule) -> float:
         """Seconds of a training step: the least of two, after a first."""
-        data, wanted = self._split("train", module.inputs), self._batch_size
+        data, wanted = self.trials.split("train", module.inputs), self._batch_size
         batch = default_collate([data[k % len(data)] for k in range(wanted)])
         batch = {name: value.to(self.device) for name, value in batch.items()}
         module = module.to(self.device).train()
@@ -252,91 +242,20 @@ class Search:
 
     def train(self, candidate: Candidate, seed: int, steps: int, begun: int) -> bool:
         """Train on from `begun` to `steps` and score on the validation split; False if it diverges."""
-        run, entry = self.run_of(candidate, seed), self.entries[candidate]
-        record = run / f"{steps}.json"
-        if not record.exists():
-            begin, took = now(), dict[str, Any]()
-            try:
-                done = self._fit(run, candidate, seed, steps)
-                took["scores"] = self.score(run, "val")
-            except DivergedError as error:
-                done, took["diverged"] = steps - begun, str(error)
-            # Where a killed training went on: as if this process had done all the steps.
-            seconds = now() - begin + (steps - begun - done) * entry.cost["step_s"]
-            write_bytes(record, json.dumps({**took, "seconds": seconds}).encode())
-        content = json.loads(record.read_text())
-        self.spent += content["seconds"]
-        if "diverged" in content:
+        entry = self.entries[candidate]
+        found = self.trials.train(candidate, seed, steps, begun, entry.cost["step_s"])
+        self.spent += found["seconds"]
+        if "diverged" in found:
             entry.status = "diverged"
             return False
-        self._ratios.append(content["seconds"] / self._nominal(candidate, steps - begun))
+        self._ratios.append(found["seconds"] / self._nominal(candidate, steps - begun))
         entry.steps = steps
         return True
 
-    def run_of(self, candidate: Candidate, seed: int) -> Path:
-        """The directory of a training."""
-        return self.directory / f"{candidate.slug}-seed{seed}"
-
-    def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
-        """Train up to `steps`; how many of them were done now."""
-        logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
-        own = {
-            "seed_everything": seed,
-            "model": {"init_args": {"seed": seed}},
-            "data": {"seed": seed},
-            "trainer": {
-                "max_steps": steps, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
-                "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
-            },
-        }  # fmt: skip
-        file = run / "run.yaml"
-        write_bytes(file, yaml.safe_dump(merge(self.ladder.config(candidate), own)).encode())
-        arguments, before = ["fit", f"--config={file}"], 0
-        if checkpoint := newest_checkpoint(run):
-            before = read_checkpoint(checkpoint)["global_step"]
-            arguments.append(f"--ckpt_path={checkpoint}")
-        if before < steps:
-            training.run_lightning(arguments)
-        return steps - before
-
-    def load(self, run: Path) -> RenderingModule:
-        """A trained candidate."""
-        checkpoint = newest_checkpoint(run)
-        assert checkpoint is not None
-        return RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
-
-    @torch.inference_mode()
-    def score(self, run: Path, split: str) -> Scores:
-        """The scores of every image of a split.
-
-        Raises:
-            DivergedError: a prediction is not finite.
-        """
-        module = self.load(run)
-        metrics, found = ImageMetrics(perceptual=False).to(self.device), []
-        for cpu_batch in DataLoader(self._split(split, module.inputs), batch_size=_BATCH, collate_fn=collated):
-            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            with self.policy.applied(self.device):
-                prediction = module(batch)
-            if not prediction.isfinite().all():
-                raise DivergedError(f"a prediction is not finite, among {split} samples {batch['index'].tolist()}")
-            found.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
-        return {key: torch.cat([each[key] for each in found]).tolist() for key in SCORES}
-
-    def _split(self, split: str, inputs: tuple[str, ...] | None = None) -> LightTransportDataset:
-        return LightTransportDataset(self.dataset, self.ladder.spec, split, inputs)
-
     def scores(self, candidate: Candidate, key: str, seeds: Sequence[int]) -> np.ndarray:
-        """(S, N) on the validation split: seeds and images."""
-        steps = self.entries[candidate].steps
-        found = [json.loads((self.run_of(candidate, s) / f"{steps}.json").read_text()) for s in seeds]
-        return np.array([each["scores"][key] for each in found])
+        """(S, N) on the validation split, after all the candidate's steps: seeds and images."""
+        return self.trials.scores(candidate, key, seeds, self.entries[candidate].steps)
 
     def errors(self, candidates: list[Candidate], key: str) -> dict[Candidate, np.ndarray]:
         """Scores of candidates that were trained with all `seeds`, as errors: the lower the better."""
         return {c: as_error(key, self.scores(c, key, self.seeds)) for c in candidates}
-
-
-def as_error(key: str, scores: np.ndarray) -> np.ndarray:
-    """Scores so that lower is better."""
-    return scores if METRICS[key].direction == "lower" else 1 - scores

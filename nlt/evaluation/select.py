@@ -18,8 +18,9 @@ from nlt.evaluation.choice import choose, paired_difference
 from nlt.evaluation.ladder import Candidate, Ladder
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
-from nlt.evaluation.search import SCORES, Search, as_error
+from nlt.evaluation.search import Search
 from nlt.evaluation.selection import draw_front, markdown
+from nlt.evaluation.trials import SCORES, as_error
 from nlt.metrics.quantities import COSTS
 
 Row = dict[str, Any]
@@ -130,10 +131,9 @@ def _confirm(search: Search, picks: dict[str, Candidate]) -> list[Row]:
 
 
 def _test_scores(search: Search, candidate: Candidate, seed: int) -> dict[str, list[float]]:
-    run = search.run_of(candidate, seed)
-    file = run / f"test-{search.entries[candidate].steps}.json"
+    file = search.trials.run_of(candidate, seed) / f"test-{search.entries[candidate].steps}.json"
     if not file.exists():
-        write_bytes(file, json.dumps(search.score(run, "test")).encode())
+        write_bytes(file, json.dumps(search.trials.score(candidate, seed, "test")).encode())
     return dict(json.loads(file.read_text()))
 
 

@@ -1,0 +1,119 @@
+"""The trainings of a ladder's candidates: each goes on from its checkpoint, and is scored; what was found is kept."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch.utils.data import DataLoader
+
+from nlt import training
+from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.files import write_bytes
+from nlt.data.spec import merge
+from nlt.errors import DivergedError
+from nlt.evaluation.ladder import Candidate, Ladder
+from nlt.metrics.image_metrics import ImageMetrics
+from nlt.metrics.quantities import METRICS
+from nlt.models.module import RenderingModule
+from nlt.models.policy import Policy
+from nlt.training import newest_checkpoint, read_checkpoint
+
+SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
+_BATCH = 16
+
+now = time.perf_counter
+Scores = dict[str, list[float]]  # of every image, by the keys of SCORES
+
+
+class Trials:
+    """Trainings in `directory`, a directory each by candidate and seed."""
+
+    def __init__(self, ladder: Ladder, dataset: Any, directory: Path, device: torch.device, policy: Policy) -> None:
+        self.ladder, self.dataset, self.directory = ladder, dataset, directory
+        self.device, self.policy = device, policy
+
+    def split(self, name: str, inputs: tuple[str, ...] | None = None) -> LightTransportDataset:
+        """A split of the dataset."""
+        return LightTransportDataset(self.dataset, self.ladder.spec, name, inputs)
+
+    def train(self, candidate: Candidate, seed: int, steps: int, begun: int, step_s: float) -> dict[str, Any]:
+        """Train on from `begun` to `steps` and score on the validation split, or what is known of it.
+
+        Returns `seconds`, and `scores` or, if it diverges, `diverged`. `step_s` stands for the steps that a killed
+        process has done: as if this one had done them all.
+        """
+        run = self.run_of(candidate, seed)
+        record = run / f"{steps}.json"
+        if not record.exists():
+            begin, found = now(), dict[str, Any]()
+            try:
+                done = self._fit(run, candidate, seed, steps)
+                found["scores"] = self.score(candidate, seed, "val")
+            except DivergedError as error:
+                done, found["diverged"] = steps - begun, str(error)
+            seconds = now() - begin + (steps - begun - done) * step_s
+            write_bytes(record, json.dumps({**found, "seconds": seconds}).encode())
+        return dict(json.loads(record.read_text()))
+
+    def run_of(self, candidate: Candidate, seed: int) -> Path:
+        """The directory of a training."""
+        return self.directory / f"{candidate.slug}-seed{seed}"
+
+    def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
+        """Train up to `steps`; how many of them were done now."""
+        logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
+        own = {
+            "seed_everything": seed,
+            "model": {"init_args": {"seed": seed}},
+            "data": {"seed": seed},
+            "trainer": {
+                "max_steps": steps, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
+                "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
+            },
+        }  # fmt: skip
+        file = run / "run.yaml"
+        write_bytes(file, yaml.safe_dump(merge(self.ladder.config(candidate), own)).encode())
+        arguments, before = ["fit", f"--config={file}"], 0
+        if checkpoint := newest_checkpoint(run):
+            before = read_checkpoint(checkpoint)["global_step"]
+            arguments.append(f"--ckpt_path={checkpoint}")
+        if before < steps:
+            training.run_lightning(arguments)
+        return steps - before
+
+    @torch.inference_mode()
+    def score(self, candidate: Candidate, seed: int, split: str) -> Scores:
+        """The scores of every image of a split.
+
+        Raises:
+            DivergedError: a prediction is not finite.
+        """
+        checkpoint = newest_checkpoint(self.run_of(candidate, seed))
+        assert checkpoint is not None
+        module = RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
+        metrics, found = ImageMetrics(perceptual=False).to(self.device), []
+        for cpu_batch in DataLoader(self.split(split, module.inputs), batch_size=_BATCH, collate_fn=collated):
+            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
+            with self.policy.applied(self.device):
+                prediction = module(batch)
+            if not prediction.isfinite().all():
+                raise DivergedError(f"a prediction is not finite, among {split} samples {batch['index'].tolist()}")
+            found.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
+        return {key: torch.cat([each[key] for each in found]).tolist() for key in SCORES}
+
+    def scores(self, candidate: Candidate, key: str, seeds: Sequence[int], steps: int) -> np.ndarray:
+        """(S, N) on the validation split: seeds and images."""
+        found = [json.loads((self.run_of(candidate, s) / f"{steps}.json").read_text()) for s in seeds]
+        return np.array([each["scores"][key] for each in found])
+
+
+def as_error(key: str, scores: np.ndarray) -> np.ndarray:
+    """Scores so that lower is better."""
+    return scores if METRICS[key].direction == "lower" else 1 - scores
