@@ -573,6 +573,9 @@ def test_learning_curves(tmp_path, monkeypatch):
     good = {"method": "nlt", "seed": 0, "train_images": 400, "status": "ok", "mse": 0.25, "fid": 20.0}
     write_rows(tmp_path / "training_images.csv", [lost, good])
     learning_curves.draw_learning_curves(results)
+    assert len(drawn.pop().axes) == 1  # of an earlier table: this one was not asked for it
+    results.manifest["train_images"] = [100]
+    learning_curves.draw_learning_curves(results)
     first, unused, few, fid = drawn[0].axes
     lines = {line.get_label(): line.get_xydata().T.tolist() for line in first.lines}
     assert lines == {

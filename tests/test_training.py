@@ -15,7 +15,7 @@ from nlt.baselines.cnn import CNN
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import write_shard
+from nlt.data.store import points_name, read_points, write_shard
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.training import run_lightning
@@ -107,6 +107,22 @@ def test_sample_that_is_not_finite(tiny, tmp_path, capfd):
     assert error.startswith("nlt: error: train/loss is nan at step ") and error.count("\n") == 1
     samples = error.partition("samples [")[2].partition("]")[0].split(", ")
     assert len(samples) == 2 and str(4 + 2) in samples
+
+
+def test_embeddings_of_other_points_are_refused(tiny, checkpoint, tmp_path, capfd):
+    """The points in another order: a CNN does not mind, embeddings would be of others."""
+    trainer = run_lightning(tiny.command("fit", "nlt", "--trainer.max_steps=1")).trainer
+    path = trainer.checkpoint_callback.best_model_path
+    directory, config = copy_dataset(tiny, tmp_path)
+    points = read_points(directory / points_name(0))
+    write_shard(directory / points_name(0), [{**points, "position": points["position"][::-1].copy()}])
+    elsewhere = [f"--config={config}", f"--trainer.default_root_dir={tmp_path}"]
+    for command in ("validate", "fit"):
+        assert main(tiny.command(command, "cnn", *elsewhere, f"--ckpt_path={checkpoint}")) == 0
+        capfd.readouterr()
+        assert main(tiny.command(command, "nlt", *elsewhere, f"--ckpt_path={path}")) == 2
+        error = capfd.readouterr().err
+        assert "other points than those that the checkpoint's embeddings are of" in error and str(directory) in error
 
 
 def test_mixed_precision(tiny, tmp_path, monkeypatch):

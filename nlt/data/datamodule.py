@@ -70,8 +70,18 @@ class LightTransportDataModule(L.LightningDataModule):
         return {"points": self.points, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on where a checkpoint's run was."""
+        """Go on where a checkpoint's run was.
+
+        Raises:
+            UserError: the method has embeddings, of other points than the dataset's.
+        """
         self.passes = state_dict.get("passes", 0)
+        points, method = state_dict.get("points"), getattr(self.trainer, "lightning_module", None)
+        if getattr(method, "embeds", False) and points and self.points and points != self.points:
+            raise UserError(
+                f"{self.directory}: has other points than those that the checkpoint's embeddings are of, as when it is "
+                "rendered with another NLT_VARIANT; give --data.root with the checkpoint's own dataset, or train anew"
+            )
 
     @property
     def num_scenes(self) -> int:

@@ -34,7 +34,6 @@ from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, default_device
-from nlt.models.transport import PointEmbedding
 from nlt.paths import find_config
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
@@ -170,7 +169,7 @@ def render(
         device = default_device()
         policy = Policy.for_device(device)
         model = ModelRenderer(method, spec, index, device)
-        if _embeds(method) and points and points_crc(model.points) != points[index]:
+        if method.embeds and points and points_crc(model.points) != points[index]:
             raise UserError(
                 f"CKPT: {checkpoint}: has embeddings of other points than there are here, as with another NLT_VARIANT; "
                 f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
@@ -201,8 +200,7 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     """The dataset's spec with the scene, and which it is."""
     files = [find_config("scenes", name).resolve() for name in spec.scenes]
     file = find_config("scenes", scene).resolve()
-    embeds = _embeds(method)
-    if embeds:
+    if method.embeds:
         points = min(spec.points, method.hparams["max_points"] or spec.points)
         if (method.hparams["num_scenes"], method.hparams["num_points"]) != (len(files), points):
             raise UserError(
@@ -212,16 +210,12 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     if file in files:
         return spec, files.index(file)
     load_description(scene)
-    if embeds:
+    if method.embeds:
         raise UserError(
             f"SCENE: {scene}: {checkpoint} has embeddings of the points of {', '.join(spec.scenes)} alone; "
             "name one of these, or train on this scene"
         )
     return dataclasses.replace(spec, scenes=[scene]), 0
-
-
-def _embeds(method: RenderingModule) -> bool:
-    return any(isinstance(part, PointEmbedding) for part in method.modules())
 
 
 def _digest(*parts: bytes) -> str:

@@ -148,9 +148,10 @@ class Results:
         return dataclasses.replace(self, manifest=manifest, runs=runs, timings=[])
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """Those of history.csv or training_images.csv; none where there is no such file."""
+        """Those of history.csv or training_images.csv; none without such a file of this table."""
         path = self.directory / name
-        return read_rows(path) if path.exists() else []
+        stale = name == TRAINING_IMAGES and not self.manifest.get("train_images")
+        return read_rows(path) if path.exists() and not stale else []
 
     def images(self, name: str) -> dict[str, np.ndarray] | None:
         """The arrays of images/`name`.npz: a method, "reference", "noisy" or "gbuffer"; None where there is none."""

@@ -19,6 +19,7 @@ from nlt.models import losses
 from nlt.models.method import Batch, Method
 from nlt.models.policy import project_sparsely
 from nlt.models.projection import SparseMap, average_sparsely, project, visible_pixels
+from nlt.models.transport import PointEmbedding
 from nlt.models.unet import UNet
 
 # The names in a batch that the two shared inputs read.
@@ -158,6 +159,11 @@ class RenderingModule(Method, L.LightningModule):
         exposed = self.unet(dense.contiguous(memory_format=torch.channels_last), sparse)
         # Out of what layout and, under autocast, precision the convolutions ran in.
         return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
+
+    @property
+    def embeds(self) -> bool:
+        """Whether something is learned of each point, which holds for these scenes' points alone."""
+        return any(isinstance(part, PointEmbedding) for part in self.modules())
 
     @property
     def num_photons(self) -> int | None:
