@@ -5,9 +5,12 @@
 set -eu
 scale=${1:-small}
 mkdir -p runs/done
-publish() {
+once() {
     done="runs/done/$(echo "$*" | tr ' /' '--')-$scale"
-    [ -e "$done" ] || { nlt compare --scale "$scale" --workers "${WORKERS:-2}" "$@" && touch "$done"; }
+    [ -e "$done" ] || { "$@" && touch "$done"; }
+}
+publish() {
+    once nlt compare --scale "$scale" --workers "${WORKERS:-2}" "$@"
 }
 publish --config table2 --seeds 3
 publish --config table1 --seeds 3
@@ -16,5 +19,8 @@ publish --config static_kitchen
 publish --config static_bathroom
 publish --config table2 --data dynamic_moving_lights
 publish --config table1 --data dynamic_fixed_lights
-nlt stress --config table2 --scale "$scale"
-[ "$scale" != small ] || { python benchmarks/leaner.py --seeds 2; python benchmarks/selection.py; }
+once nlt stress --config table2 --scale "$scale"
+if [ "$scale" = small ]; then
+    once python benchmarks/leaner.py --seeds 2
+    once python benchmarks/selection.py --minutes 20
+fi

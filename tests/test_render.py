@@ -56,8 +56,8 @@ def pixels(path):
     return np.asarray(Image.open(path))
 
 
-@pytest.mark.parametrize("light", [None, "turntable"])
-def test_frames_are_predictions(models, tmp_path, monkeypatch, light):
+@pytest.mark.parametrize(("light", "size"), [(None, SIZE), ("turntable", (20, 12))])  # fewer pixels than points, more
+def test_frames_are_predictions(models, tmp_path, monkeypatch, light, size):
     """Left, what the method says of the same samples, stored and read as any; right, path tracing.
 
     Photons are cast and light is transported once for a state.
@@ -66,13 +66,13 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light):
     photons, transport = Renderer.photons, NeuralLightTransport.transport
     monkeypatch.setattr(Renderer, "photons", lambda *a: cast.append(a) or photons(*a))
     monkeypatch.setattr(NeuralLightTransport, "transport", lambda *a: transported.append(a) or transport(*a))
-    render(str(models.nlt), "living_room", "frames", "3", light, frames=3, resolution=SIZE, spp=2)
+    render(str(models.nlt), "living_room", "frames", "3", light, frames=3, resolution=size, spp=2)
     # 7 are timed, the last of them in the first frame's state.
     assert len(cast) == len(transported) == (1 if light is None else 7 + 2)
 
     method, spec, _ = load_trained(str(models.nlt))
     renderer = SampleRenderer(spec, 0)
-    views = cameras(renderer.description, "turntable", 3, *SIZE)
+    views = cameras(renderer.description, "turntable", 3, *size)
     moments = states(renderer.description, "moving_lights", "3", light, 3)
     samples, traced = [], []
     for k, (moment, view) in enumerate(zip(moments, views, strict=True)):
