@@ -92,8 +92,8 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "stress":
         from nlt.evaluation.stress import stress
 
-        names = (options.methods, options.suites, options.manifest)
-        stress(options.config, options.out, options.scale, options.data, *names)
+        how = (options.methods, options.suites, options.manifest, options.views)
+        stress(options.config, options.out, options.scale, options.data, *how)
     elif options.command == "report":
         from nlt.evaluation.report import draw
 
@@ -202,6 +202,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--methods", nargs="+", help="of configs/model (default: the comparison's, else all)")
     stress.add_argument("--suites", nargs="+", type=_suite, help="of the manifest (default: all)")
     stress.add_argument("--manifest", default="suites", help="of configs/stress, by name or path (default: suites)")
+    stress.add_argument("--views", type=_positive, help="of each scene (default: the manifest's)")
     compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
     compare.add_argument(
         "--train-images", nargs="+", type=_positive, default=[], metavar="N",

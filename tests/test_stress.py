@@ -21,6 +21,7 @@ from nlt.data.changed_scene import MESHES, ChangedScene
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import merge
 from nlt.data.stage import PLACES, Stage
+from nlt.data.stress import rungs
 from nlt.data.suites import load_suites
 from nlt.errors import UserError
 from nlt.evaluation.changed_inputs import BUDGET, FRAME
@@ -43,6 +44,13 @@ def test_the_manifest_names_changes_that_there_are():
     known = {*MESHES, *PLACES, "points", "photons", "pixels", "spp", "shifted", "turned", "mirrored"}
     assert {ladder.change for ladder in suites.ladders} == known
     assert len({(ladder.suite, ladder.name) for ladder in suites.ladders}) == len(suites.ladders)
+
+
+def test_fewer_views_are_another_set(spec, tmp_path):
+    """They do not mix with what the manifest's number of views has rendered."""
+    whole, fewer = load_suites("suites"), load_suites("suites", views=1)
+    assert {rung.views for rung in rungs(spec, fewer, ["camera"])} == {1} != {whole.views}
+    assert whole.directory(spec, tmp_path) != fewer.directory(spec, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -57,14 +57,14 @@ class Suites:
         return open_path(root) / f"{spec.directory(root).name}-stress-{digest}"
 
 
-def load_suites(config: str) -> Suites:
-    """Read a manifest by name or path.
+def load_suites(config: str, views: int | None = None) -> Suites:
+    """Read a manifest by name or path; `views` of each scene override its own.
 
     Raises:
         UserError: a key is unknown or missing, or a value is not what it should be.
     """
     file = find_config("stress", config)
-    content = read_configs([str(file)])
+    content = read_configs([str(file)]) | ({} if views is None else {"views": views})
     ladders = []
     for section, known in _KEYS.items():
         _check(file, section, content.get(section, {}) if section else content, known)

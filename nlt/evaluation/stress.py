@@ -44,14 +44,17 @@ def stress(
     methods: list[str] | None = None,
     suites: list[str] | None = None,
     manifest: str = "suites",
+    views: int | None = None,
 ) -> Path:
     """Train what `nlt compare` would have, render the suites, judge; what is there already is kept.
+
+    `views` of each scene: the manifest's unless given.
 
     Raises:
         UserError: a config is wrong, or an output is not finite; then, too, everything is written.
     """
     start, begun = time.time(), origin()
-    comparison, content = Comparison.load(config, scale, data, methods), load_suites(manifest)
+    comparison, content = Comparison.load(config, scale, data, methods), load_suites(manifest, views)
     wanted = list(suites or SUITES)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
@@ -66,7 +69,7 @@ def stress(
     device = default_device()
     policy = Policy.for_device(device, comparison.precision)
     directory = Path(out or Path("results") / comparison.name) / STRESS
-    views = SuiteViews(rendered, spec, content, wanted, device, policy)
+    suite_views = SuiteViews(rendered, spec, content, wanted, device, policy)
     record = {
         **begun, **surroundings(device, policy), "comparison": comparison.name, "dataset": dataset.name,
         "suites": rendered.name, "views": min(content.views, spec.test), "scenes": [d.name for d in spec.descriptions],
@@ -98,13 +101,13 @@ def stress(
             images = directory / IMAGES / f"{suite}-{name}.npz"
             mark = f"{rendered.name} {label['run']} {content.content.get(suite)}"
             if not _is_there(images, mark, own):
-                found, radiance = views.judge(method, suite)
+                found, radiance = suite_views.judge(method, suite)
                 rows = [row for row in rows if (row["method"], row["suite"]) != (name, suite)]
                 rows += [{**label, "suite": suite, **row} for row in found]
                 write_rows(directory / ROWS, rows)
                 write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
                 if suite not in (FLICKER, *shown):
-                    write_images(directory, f"{suite}-reference", **views.references(suite))
+                    write_images(directory, f"{suite}-reference", **suite_views.references(suite))
                     shown.add(suite)
                 # The last: all is there.
                 write_images(directory, images.stem, **radiance, mark=np.array(mark), rows=np.array(len(found)))
@@ -112,8 +115,8 @@ def stress(
     bar.close()
     write_rows(directory / ROWS, rows)
     if TRAINING in wanted:
-        clean = views.batches(CLEAN)["views", 0]
-        error = lambda method: float(np.mean([row["error"] for row in views.rows(method, clean)[0]]))
+        clean = suite_views.batches(CLEAN)["views", 0]
+        error = lambda method: float(np.mean([row["error"] for row in suite_views.rows(method, clean)[0]]))
         train_suite(directory, comparison, content.content[TRAINING], runs, error, device)
     if _measured(directory) != before:  # else the manifest is of the run that measured it
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})

@@ -157,8 +157,9 @@ def introduction(stressed: Stressed) -> str:
     """What was measured, of what, and what was left out."""
     manifest = stressed.manifest
     return (
-        f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: {manifest['views']} views of "
-        f"{', '.join(manifest['scenes'])} at each severity, suites of version {manifest['manifest']['version']}. "
+        f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: at each severity "
+        f"{manifest['views']} of each scene's views ({', '.join(manifest['scenes'])}), "
+        f"suites of version {manifest['manifest']['version']}. "
         "Errors are squared, relative to the reference's square (plus 0.01) at each pixel, without the reference's "
         "noise; a method breaks where its error is twice that of the clean views."
         + (f" Left out: {'; '.join(manifest['left_out'])}." if manifest["left_out"] else "")
