@@ -1,8 +1,8 @@
 """Copies what the documentation shows out of results/ and the code: `python scripts/update_readme.py`.
 
 A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
-(`results/NAME/table.md`), what the stress suites (`results/NAME/stress/stress.md`) or the study of sizes
-(`results/leaner/leanest.md`) say, a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
+(`results/NAME/table.md`, of which the first is shown), another page of results (shown whole, such as
+`results/NAME/stress/stress.md`), a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
 """
 
 import re
@@ -22,7 +22,7 @@ def content(source: str) -> str:
         return field_table(getattr(sample, name))
     if path == "scripts/paper_scale.py":
         return str(runpy.run_path(str(PROJECT / path))["tables"](PROJECT / "results/bench/target"))
-    return body(PROJECT / path) if path.endswith(("/stress.md", "/leanest.md")) else first_table(PROJECT / path)
+    return first_table(PROJECT / path) if path.endswith("/table.md") else body(PROJECT / path)
 
 
 def body(path: Path) -> str:
