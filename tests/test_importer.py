@@ -380,6 +380,23 @@ def test_proposals(tmp_path, scale):
                     assert overlap.min() < 0.03 * scale, f"{movable.name} meets {name}"
 
 
+def test_a_room_with_a_single_table(tmp_path):
+    """All that there is stands on the table or hangs above: the floor is the floor nevertheless."""
+    scene = trimesh.Scene()
+    for name, mesh, place in (
+        ("room", trimesh.creation.box((4, 3, 5)), (0, 0, 0)),
+        ("table", trimesh.creation.box((1.2, 0.7, 0.8)), (0.3, -1.15, 0.4)),
+        ("ball", trimesh.creation.icosphere(3, 0.25), (0.3, -0.55, 0.4)),
+        ("lamp", trimesh.creation.box((1, 0.05, 1)), (0, 1.4, 0)),
+    ):
+        mesh.apply_translation(place)
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    scene.export(tmp_path / "room.glb")
+    imported = importer.read(tmp_path / "room.glb")
+    found = propose(imported.scene, {s.id(): read_shape(s) for s in imported.scene.shapes()}, imported.up)
+    np.testing.assert_allclose(found.room, [[-2, -1.5, -2.5], [2, 1.5, 2.5]], atol=0.13)  # the lamp may be its ceiling
+
+
 @pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason="needs the real scenes, see README.md")
 def test_proposals_in_a_real_room():
     """The room's bounds, and five of the objects that people marked, to the shape."""

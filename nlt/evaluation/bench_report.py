@@ -117,8 +117,7 @@ def _frames(rows: list[Row], ceilings: Row) -> list[str]:
     lines = _table(["method", *names, "frame", "plain frame", "ratio", "peak MiB", "frames"], table)
     if reached:
         header = ["synthesis", "precision", "parameters", "GFLOP", "GFLOP/s", "of the ceiling"]
-        lines += [*_table(header, reached), "GFLOP: of the plain path. What takes fewer, or 8-bit integers, may pass the "
-                  "ceiling, which is that of this precision.", ""]  # fmt: skip
+        lines += [*_table(header, reached), "GFLOP: the plain path's; what needs fewer may pass the ceiling.", ""]
     return lines
 
 

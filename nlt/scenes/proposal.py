@@ -111,46 +111,45 @@ def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
 
 def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
     """The inside of the room: floor and ceiling where vertical rays end, walls where horizontal ones do."""
-    size = np.ptp(bounds, axis=0)
+    size, across = np.ptp(bounds, axis=0), [k for k in range(3) if k != axis]
     boxes = np.stack([_box(s.vertices) for s in shapes.values()])
     small = (np.ptp(boxes, axis=1) < 0.4 * size.max()).all(1)
     centres = boxes[small].mean(1) if small.any() else bounds.mean(0)[None]
     low, high = np.quantile(centres, [0.02, 0.98], axis=0)
     contents = np.stack([low - 0.02 * size, high + 0.02 * size]).clip(*bounds)
-    counts = [24, 24, 24]
-    counts[axis] = 3
+    room, ended = bounds.astype(float).copy(), np.zeros((2, 3), bool)
+
+    def measure(inside: np.ndarray, axes: list[int], layers: int, tolerance: float) -> None:
+        """The room's sides across `axes`, by rays from all over a box, where enough of them end."""
+        counts = [24, 24, 24]
+        counts[axis] = layers
+        starts = _grid(inside, (counts[0], counts[1], counts[2]))
+        for k in axes:
+            for side, sign in enumerate((-1, 1)):
+                t = trace(scene, starts, np.tile(sign * np.eye(3)[k], (len(starts), 1)))
+                ends = (starts[:, k] + sign * t)[np.isfinite(t)]
+                if len(ends) >= len(starts) / 5:
+                    room[side, k] = _level(ends, tolerance * size[k], highest=bool(side))
+                    ended[side, k] = True
+
     middle = contents.copy()
-    span = size[axis]
-    middle[:, axis] = np.quantile(centres[:, axis], [0.4, 0.6]) + np.array([-0.01, 0.01]) * span
-    starts = _grid(middle, (counts[0], counts[1], counts[2]))
-    ends = {}
-    for sign in (-1, 1):
-        t = trace(scene, starts, np.tile(sign * np.eye(3)[axis], (len(starts), 1)))
-        ends[sign] = (starts[:, axis] + sign * t)[np.isfinite(t)]
-    open_sides = [name for sign, name in ((-1, "floor"), (1, "ceiling")) if len(ends[sign]) < len(starts) / 5]
-    room = bounds.astype(float).copy()
-    if len(ends[-1]) >= len(starts) / 5:
-        room[0, axis] = _level(ends[-1], 0.01 * span, highest=False)
-    if len(ends[1]) >= len(starts) / 5:
-        room[1, axis] = _level(ends[1], 0.01 * span, highest=True)
-    between = room.copy()
-    height = room[1, axis] - room[0, axis]
+    middle[:, axis] = np.quantile(centres[:, axis], [0.4, 0.6]) + np.array([-0.01, 0.01]) * size[axis]
+    measure(middle, [axis], 3, 0.01)
+    height = np.ptp(room[:, axis])
+    between = contents.copy()
     between[:, axis] = room[0, axis] + height * np.array([0.55, 0.9])
-    counts[axis] = 4
-    inside = between.copy()
-    for k in (j for j in range(3) if j != axis):
-        inside[:, k] = contents[:, k]
-    starts = _grid(inside, (counts[0], counts[1], counts[2]))
-    for k in (j for j in range(3) if j != axis):
-        for side, sign in ((0, -1), (1, 1)):
-            t = trace(scene, starts, np.tile(sign * np.eye(3)[k], (len(starts), 1)))
-            ended = (starts[:, k] + sign * t)[np.isfinite(t)]
-            if len(ended) < len(starts) / 5:
-                open_sides.append(f"{'-+'[side]}{'xyz'[k]} wall")
-                reach = contents[side, k] + sign * 2 * height
-                room[side, k] = max(reach, bounds[0, k]) if side == 0 else min(reach, bounds[1, k])
-            else:
-                room[side, k] = _level(ended, 0.02 * size[k], highest=bool(side))
+    measure(between, across, 4, 0.02)
+    outward = np.array([[-1], [1]])
+    # Few things may all stand on one table: once more from wherever the walls let, for what is far from that.
+    before = room[:, axis].copy()
+    middle[:, across] = np.where(ended, room - 0.05 * outward * size, contents)[:, across]
+    measure(middle, [axis], 3, 0.01)
+    room[:, axis] = np.where(np.abs(room[:, axis] - before) > 0.1 * height, room[:, axis], before)
+    reach = (contents + 2 * outward * height).clip(*bounds)
+    room[:, across] = np.where(ended, room, reach)[:, across]
+    names = [[f"{sign}{letter} wall" for letter in "xyz"] for sign in "-+"]
+    names[0][axis], names[1][axis] = "floor", "ceiling"
+    open_sides = [names[side][k] for k in (axis, *across) for side in (0, 1) if not ended[side, k]]
     said = "where rays from its middle end"
     return room, said + (f"; none end at the {', '.join(open_sides)}" if open_sides else "")
 
