@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from nlt import __version__
 from nlt.errors import UserError, as_mistake
+from nlt.waiting import wait_passively
 
 _LIGHTNING = {
     "fit": "train one method, of configs of data, model and scale",
@@ -17,6 +18,9 @@ _LIGHTNING = {
     "test": "compute all metrics of a checkpoint on the test split",
     "predict": "write a checkpoint's images of the test split",
 }
+
+# Commands in which Mitsuba and PyTorch take turns at frames.
+_FRAMES = ("bench", "compare", "render")
 
 # Words of several commands' help.
 _OUT, _IMAGE = "directory of the results (default: {})", "image to write (default: {})"
@@ -63,6 +67,8 @@ def _run(arguments: list[str]) -> int:
         run_lightning(arguments)
         return 0
     options = _parser().parse_args(arguments)
+    if options.command in _FRAMES:
+        wait_passively()
     if options.command == "generate":
         from nlt.data.generate import generate
         from nlt.data.spec import load_spec

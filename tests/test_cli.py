@@ -11,6 +11,7 @@ import yaml
 from conftest import write_room, write_yaml
 from tiny import DATASET, SCALE, copy_dataset, write
 
+from nlt import waiting
 from nlt.cli import _parser, main
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
@@ -25,6 +26,21 @@ def elsewhere(tmp_path, monkeypatch):
     """In an empty directory, as if the shell had been given arguments."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["nlt", "fit", "--config=x.yaml"])
+
+
+@pytest.mark.parametrize(("given", "inherited"), [(None, None), ("active", "active"), ("passive", "passive")])
+def test_threads_wait_passively_where_the_user_says_nothing(monkeypatch, given, inherited):
+    """A frame's process; the trainings that it starts wait as they would without it."""
+    monkeypatch.setattr(waiting, "_ours", False)
+    monkeypatch.setenv(waiting.WAIT_POLICY, given or "")
+    if given is None:
+        monkeypatch.delenv(waiting.WAIT_POLICY)
+    for _ in range(2):
+        waiting.wait_passively()
+        assert os.environ[waiting.WAIT_POLICY] == (given or "passive")
+        with waiting.as_the_user_said():
+            assert os.environ.get(waiting.WAIT_POLICY) == inherited
+        assert os.environ[waiting.WAIT_POLICY] == (given or "passive")
 
 
 def test_help_imports_nothing_heavy():

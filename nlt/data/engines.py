@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from nlt.errors import UserError
+from nlt.waiting import as_the_user_said
 
 # work(job, threads, tick) does a job with so many threads and calls tick(n) after every n samples.
 Work = Callable[[Any, int, Callable[[int], None]], None]
@@ -242,7 +243,8 @@ def _forking(preload: tuple[str, ...]) -> Any:
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # else it imports from elsewhere than we, before Python 3.13
     try:
-        forkserver.ensure_running()
+        with as_the_user_said():
+            forkserver.ensure_running()
     finally:
         if before is None:
             del os.environ["PYTHONPATH"]

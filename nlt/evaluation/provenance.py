@@ -20,6 +20,7 @@ from nlt.metrics.inception import find_weights
 from nlt.models.policy import Policy
 from nlt.paths import PROJECT
 from nlt.rendering.variant import choose_variant
+from nlt.waiting import WAIT_POLICY
 
 _PACKAGES = (
     "nlt", "torch", "lightning", "torchmetrics", "mitsuba", "drjit", "numpy", "safetensors", "flip-evaluator",
@@ -45,6 +46,7 @@ def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str
     return {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
         "threads": torch.get_num_threads(),
+        "wait_policy": os.environ.get(WAIT_POLICY),
         "platform": platform.platform(),
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
