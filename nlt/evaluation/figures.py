@@ -64,7 +64,7 @@ def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figur
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, name in zip(axes[0], columns, strict=True):
-        axis.set_title(name.replace(" (", "\n("), fontsize=7)
+        axis.set_title(name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n("), fontsize=7)
     figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - _TITLE / size[1], 0.02, 0.02)
     return figure, axes
 
