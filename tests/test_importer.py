@@ -1,7 +1,10 @@
 """Scene files of every dialect become the same scene: against twins in Mitsuba 3's own words, and analytic values."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 
 import mitsuba as mi
 import numpy as np
@@ -395,6 +398,17 @@ def test_a_room_with_a_single_table(tmp_path):
     imported = importer.read(tmp_path / "room.glb")
     found = propose(imported.scene, {s.id(): read_shape(s) for s in imported.scene.shapes()}, imported.up)
     np.testing.assert_allclose(found.room, [[-2, -1.5, -2.5], [2, 1.5, 2.5]], atol=0.13)  # the lamp may be its ceiling
+
+
+@pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason="needs the real scenes, see README.md")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps no process to one core")
+def test_a_real_room_loads_on_one_core():
+    """Mitsuba would wait for a second thread, for ever."""
+    command = [sys.executable, "-m", "nlt.cli", "scenes", "check", str(scenes_root() / "living-room/scene.xml")]
+    one = {min(os.sched_getaffinity(0))}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120,
+                          preexec_fn=lambda: os.sched_setaffinity(0, one), check=True)  # fmt: skip
+    assert "movable objects: " in done.stdout
 
 
 @pytest.mark.skipif(not (scenes_root() / "living-room").is_dir(), reason="needs the real scenes, see README.md")

@@ -43,7 +43,7 @@ class SampleRenderer:
         self._states: dict[str, Any] | None = None
         self._taken: set[bytes] = set()  # states of the evaluated splits
         if threads:
-            dr.set_thread_count(threads)  # not earlier: with one thread, loading a scene waits for ever
+            dr.set_thread_count(threads)  # not earlier: see `use_variant`
 
     def points(self) -> dict[str, np.ndarray]:
         """The scene's point cloud."""

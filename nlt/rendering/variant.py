@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 
 from nlt.errors import UserError
@@ -35,6 +36,7 @@ def use_variant() -> Variant:
     """Choose, activate and log a Mitsuba variant; `NLT_VARIANT` names one to use without probing."""
     variant = choose_variant()
     mi.set_variant(variant.name)
+    dr.set_thread_count(max(2, dr.thread_count()))  # with one, on one core, loading some scenes waits for ever
     # Quiet about what we handle ourselves; errors still come as exceptions.
     mi.set_log_level(mi.LogLevel.Error)
     log.info("Mitsuba variant %s: %s", variant.name, variant.reason)
