@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from nlt.evaluation.clock import _AliveMemory
 from nlt.models import policy
 from nlt.models.int8 import convolve
 from nlt.models.policy import Policy
@@ -82,6 +83,14 @@ def test_the_policy_takes_large_ones_without_gradients(monkeypatch):
     assert not none and not rather_not
     assert (image.float() - expected).square().mean() < 0.02**2 * expected.square().mean()
     assert not run(Policy(bfloat16=True, int8=True))[1]  # with gradients
+
+
+def test_memory_is_counted():
+    """As the clock does; what oneDNN has packed has no storage that could be asked."""
+    conv, x = made(64, 64, (16, 16))
+    with torch.no_grad(), _AliveMemory() as memory:
+        y = convolve(conv, x, {}, relu=True)
+    assert y.numel() * 2 + x.numel() <= memory.peak < 64 * (y.numel() + conv.weight.numel())
 
 
 @pytest.mark.parametrize(("precision", "taken"), [("auto", True), ("bf16", False), ("32", False)])

@@ -177,11 +177,10 @@ class _AliveMemory(TorchDispatchMode):
         self._known: set[int] = set()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        given = {leaf.untyped_storage().data_ptr() for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)}
+        given = {storage.data_ptr() for storage in _storages((args, kwargs))}
         result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, Tensor) and leaf.untyped_storage().data_ptr() not in given | self._known:
-                storage = leaf.untyped_storage()
+        for storage in _storages(result):
+            if storage.data_ptr() not in given | self._known:
                 self._known.add(storage.data_ptr())
                 self.now += storage.nbytes()
                 weakref.finalize(storage, self._freed, storage.data_ptr(), storage.nbytes())
@@ -191,3 +190,9 @@ class _AliveMemory(TorchDispatchMode):
     def _freed(self, pointer: int, size: int) -> None:
         self._known.discard(pointer)
         self.now -= size
+
+
+def _storages(tree: Any) -> list[Any]:
+    """Of the tensors in it; weights that oneDNN has packed show none."""
+    leaves = (leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor) and leaf.layout == torch.strided)
+    return [leaf.untyped_storage() for leaf in leaves]
