@@ -13,8 +13,6 @@ from nlt.paths import PROJECT, find_config
 
 METHODS = 9  # of the paper's Table 2
 CORE_HOUR, GPU_HOUR = 0.04, 3.0  # dollars, assumed
-# Training projects to dense maps, which the first convolution reads whole: 103.7 GFLOP to 94.3 at this size.
-DENSE = 1.1
 TFLOPS = (20, 100)  # that one GPU may sustain, assumed
 BACKWARD = 3  # a training step's work, in forward passes
 
@@ -41,7 +39,7 @@ def tables(bench: Path) -> str:
     )
     disk = scenes * (spec.train * spec.nbytes("train") + judged * spec.nbytes("test"))
     steps = cores / 3600 * images / training["images_per_second"]
-    work = BACKWARD * DENSE * frame["flops"] * images
+    work = BACKWARD * frame["flops"] * images
     lines = [
         "| rate | measured |",
         "|---|---|",
@@ -49,7 +47,7 @@ def tables(bench: Path) -> str:
         f"| rendering an evaluated sample, with its reference | {generation['evaluated_per_second']:.3f} a second |",
         f"| training the largest method, `{training['method']}`, {frame['precision']} "
         f"| {training['images_per_second']:.2f} images a second |",
-        f"| its network | {frame['flops'] / 1e9:.1f} GFLOP a frame, {DENSE:g} times as many in training |",
+        f"| its network | {frame['flops'] / 1e9:.1f} GFLOP a frame |",
         "",
         "| the paper's Table 2 | amount | follows from | cost |",
         "|---|---:|---|---:|",
@@ -63,7 +61,7 @@ def tables(bench: Path) -> str:
     for tflops in TFLOPS:
         hours = work / (tflops * 1e12) / 3600
         for what, count in ((f"a training on a GPU of {tflops} TFLOP/s", 1), (f"{METHODS} methods there", METHODS)):
-            follows = f"{BACKWARD} x {DENSE:g} x FLOPs x images" if count == 1 else "none is above the largest"
+            follows = f"{BACKWARD} x FLOPs x images" if count == 1 else "none is above the largest"
             lines.append(f"| {what} | {count * hours:,.0f} GPU-hours | {follows} | ${count * hours * GPU_HOUR:,.0f} |")
     note = (
         f"At {spec.resolution}x{spec.resolution}, in {', '.join(manifest['scenes'])}, on {manifest['device']}: "

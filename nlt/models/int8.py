@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 _STEPS = 253  # of an input, at least: in bfloat16, 255 and the half that rounds would be 256, which is 0 as a byte
 _LEAST = 1e-30  # largest value of an image
-_BLOCK = 1 << 19  # values that are rounded at a time, which then stay in the cache
+_BLOCK = 1 << 20  # values that are rounded at a time: few enough for the cache, enough for several threads
 
 
 class PackedWeights(NamedTuple):
