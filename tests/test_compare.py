@@ -254,7 +254,7 @@ def test_the_papers_figures_stand_beside_ours(world):
 def test_pictures(world):
     """A row per view, a column per method between the noisy image and the reference; nothing is black."""
     image = np.asarray(Image.open(world.folder / "out/samples.png").convert("RGB")) / 255
-    columns, views, title = len(world.rows) + 2, 3, int(0.35 * 150)
+    columns, views, title = len(world.rows) + 2, 3, int(0.35 * 100)
     height, width = (image.shape[0] - title) / views, image.shape[1] / columns
     dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test", ())
     for i in range(views):
