@@ -347,7 +347,7 @@ def test_precision(world, trainings, monkeypatch):
         world.compare("--methods", "cnn", *options, out=f"precision{bfloat16}")
         assert set(seen) == {bfloat16} and len(seen) > 4
         manifest = json.loads((world.folder / f"precision{bfloat16}/manifest.json").read_text())
-        assert manifest["policy"] == {"bfloat16": bfloat16, "sparse": bfloat16 and CPU.type == "cpu"}
+        assert manifest["policy"] == {"bfloat16": bfloat16, "sparse": bfloat16, "int8": False}
     assert "precision: 32-true" in (world.run("cnn") / "config.yaml").read_text()
     assert len(trainings) == first  # if the first comparison's is not in float32
     if trainings:

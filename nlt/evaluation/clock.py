@@ -6,6 +6,7 @@ import math
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -135,8 +136,9 @@ class Clock:
     def flops(self, method: RenderingModule) -> dict[str, int]:
         """Floating-point operations of a batch's convolutions and matrix products, by step: without any shortcut."""
         batch, result, flops = self._inputs(method), None, {}
+        straight = replace(self.policy, sparse=False, int8=False)
         for name, step in method.to(self.device).eval().steps().items():
-            with Policy().applied(self.device), FlopCounterMode(display=False) as counter:
+            with straight.applied(self.device), FlopCounterMode(display=False) as counter:
                 result = step(batch, result)
             flops[name] = counter.get_total_flops()
         return flops
