@@ -472,7 +472,7 @@ def _precision(clock: Clock, method: RenderingModule) -> str:
     """In which the last convolution gives its result."""
     found: list[torch.dtype] = []
     hook = method.unet.conv_out.register_forward_hook(lambda _, __, output: found.append(output.dtype))
-    clock.size(method)
+    clock.flops(method)
     hook.remove()
     return str(found[0]).removeprefix("torch.")
 
