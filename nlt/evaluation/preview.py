@@ -18,6 +18,9 @@ from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
 _TITLE, _GAP = 24, 4  # pixels
+_KEY = 0.18  # geometric mean of luminance in a picture that is neither dark nor burnt out (Reinhard et al. 2002)
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB (ITU-R BT.709)
+_BLACK = 1e-3  # of luminance that shows
 
 
 def contact_sheet(
@@ -31,6 +34,8 @@ def contact_sheet(
 ) -> None:
     """Write a picture of a row per scene and a column per view, each in a random state of the experiment.
 
+    Says of each scene how bright it is at its exposure, and which exposure would suit these views.
+
     Raises:
         UserError: a scene is unknown, does not load, or has no such experiment.
     """
@@ -41,7 +46,10 @@ def contact_sheet(
     choose_variant()  # once; the processes inherit it
     # A process per scene: Mitsuba's memory grows with every one.
     for row, (name, description) in enumerate(zip(names, descriptions, strict=True)):
-        images = Process(_images, description, views, resolution, spp, experiment, seed).result()
+        images, mean = Process(_images, description, views, resolution, spp, experiment, seed).result()
+        suits = description.exposure * _KEY / mean
+        at = f"mean luminance {mean:.2g} at exposure {description.exposure:g}"
+        print(f"{name}: {at}; mid-grey, {_KEY}, at exposure {suits:.2g}", flush=True)
         title = f"{name} ({experiment.replace('_', ' ')}, exposure {description.exposure:g}, {spp} spp)"
         draw.text((_GAP, row * height + _GAP), title, "black", font_size=14)
         for column, image in enumerate(images):
@@ -53,16 +61,18 @@ def contact_sheet(
 
 def _images(
     description: SceneDescription, views: int, resolution: int, spp: int, experiment: str, seed: int
-) -> list[np.ndarray]:
-    """(H, W, 3) uint8 sRGB images of one scene."""
+) -> tuple[list[np.ndarray], float]:
+    """(H, W, 3) uint8 sRGB images of one scene, and the geometric mean of their luminance as it is exposed."""
     use_variant()
     scene = Scene(description, experiment)
     renderer, sampler = Renderer(scene), Views(scene)
-    images = []
+    images, logarithms = [], []
     for k in range(views):
         rng = np.random.default_rng([seed, k])
         scene.set_state(sample_state(description, experiment, rng))
         radiance = renderer.radiance(sampler.sample(resolution, rng), spp, seed + k)
+        luminance = np.tensordot(_LUMINANCE, radiance * description.exposure, 1)
+        logarithms.append(np.log(luminance + _BLACK).mean())
         shown = display(torch.from_numpy(radiance)[None], description.exposure)[0]
         images.append((shown.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    return images
+    return images, float(np.exp(np.mean(logarithms)))

@@ -150,7 +150,7 @@ def _yaml(path: Path, name: str, imported: Imported, proposal: Proposal) -> str:
 source: {_word(str(source.relative_to(root) if source.is_relative_to(root) else source))}
 units_per_metre: {proposal.units_per_metre:g}  # {because["units_per_metre"]}
 up: {proposal.up}  # {because["up"]}
-exposure: 1.0  # check: raise it if the preview is dark, lower it if it is burnt out
+exposure: 1.0  # check: `nlt scenes preview` says which would suit
 fov: 70.0
 camera: {{min: {_numbers(proposal.camera[0])}, max: {_numbers(proposal.camera[1])}}}  # {because["camera"]}
 room: {pair(proposal.room)}  # check: {because["room"]}
