@@ -68,6 +68,21 @@ def test_resuming_is_exact(tiny, method, limit, legs, validated):
     assert state == through
 
 
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+@pytest.mark.parametrize("algorithm", ["norm", "value"])
+def test_gradients_are_clipped(tiny, precision, algorithm):
+    """By Adam's first moment after a step, which is a tenth of the gradient."""
+    options = {"max_steps": 1, "precision": precision, "gradient_clip_val": 1e-4, "gradient_clip_algorithm": algorithm}
+    trainer = run_lightning(
+        tiny.command("fit", "cnn", *(f"--trainer.{name}={value}" for name, value in options.items()))
+    ).trainer
+    moments = [10 * state["exp_avg"] for state in trainer.optimizers[0].state.values()]
+    if algorithm == "norm":
+        assert sum(moment.square().sum() for moment in moments).sqrt().item() == pytest.approx(1e-4, rel=1e-3)
+    else:
+        assert max(moment.abs().max() for moment in moments).item() == pytest.approx(1e-4, rel=1e-3)
+
+
 def test_seed(tiny):
     def losses(seed):
         trainer = run_lightning(tiny.command("fit", "cnn", f"--seed_everything={seed}")).trainer

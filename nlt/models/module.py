@@ -10,6 +10,7 @@ from typing import Any, Literal
 import lightning as L
 import torch
 from torch import Tensor
+from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import ExponentialLR
 
 from nlt.errors import DivergedError, UserError
@@ -203,6 +204,14 @@ class RenderingModule(Method, L.LightningModule):
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.parameters(), lr=self.hparams["learning_rate"], fused=True)
         return [optimizer], [ExponentialLR(optimizer, gamma=self.hparams["lr_decay"])]
+
+    def configure_gradient_clipping(
+        self, optimizer: Any, gradient_clip_val: Any = None, gradient_clip_algorithm: Any = None
+    ) -> None:
+        """As the trainer says. Lightning's own refuses a fused Adam in mixed precision, but here no loss is scaled."""
+        if gradient_clip_val:
+            clip = clip_grad_value_ if gradient_clip_algorithm == "value" else clip_grad_norm_
+            clip(self.parameters(), gradient_clip_val)
 
     def _evaluation_step(self, batch: Batch) -> Tensor:
         prediction = self(batch)
