@@ -23,6 +23,9 @@ once nlt stress --config table2 --scale "$scale"
 if [ "$scale" = small ]; then
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
-    once nlt compare --config leaner --out results/diagnosis --methods cnn cnn@iterations_1600 \
-        feature_projection feature_projection@iterations_1600 nlt_photons nlt_photons@iterations_1600
+    methods=
+    for method in cnn feature_projection nlt_photons; do
+        methods="$methods $method $method@unclipped $method@iterations_1600"
+    done
+    once nlt compare --config leaner --seeds 2 --out results/diagnosis --methods $methods
 fi
