@@ -19,7 +19,7 @@ publish --config static_kitchen
 publish --config static_bathroom
 publish --config table2 --data dynamic_moving_lights
 publish --config table1 --data dynamic_fixed_lights
-once nlt stress --config table2 --scale "$scale"
+once nlt stress --config table2 --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
