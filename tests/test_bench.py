@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -60,6 +61,22 @@ class Recorder(Method):
 
     def steps(self):
         return {"denoise": lambda batch, _: self.batches.append(batch)}
+
+
+class Samples(list):
+    """A dataset of four scenes' samples, of which only their number counts."""
+
+    spec = SimpleNamespace(scenes=list("abcd"))
+
+
+def test_the_warm_up_sees_every_scene(monkeypatch):
+    """Else the first frame in a scene, which compiles its kernels, would be timed."""
+    device, seen = torch.device("cpu"), []
+    watch = clock.Clock(SimpleNamespace(dataset=Samples(range(4 * 16))), device)
+    monkeypatch.setattr(watch, "_frame", lambda method, indices: seen.extend(indices) or {"synthesis": 0.0})
+    watch.race({"": torch.nn.Identity()})
+    assert {index // 16 for index in seen[: clock.WARM_UP]} == {0, 1, 2, 3}
+    assert len(set(seen)) == len(seen) == clock.WARM_UP + clock.FRAMES
 
 
 def test_a_batch_of_frames(tiny, monkeypatch):
