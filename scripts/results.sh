@@ -27,5 +27,5 @@ if [ "$scale" = small ]; then
     for method in cnn feature_projection nlt_photons; do
         methods="$methods $method $method@unclipped $method@iterations_1600"
     done
-    once nlt compare --config leaner --seeds 2 --out results/diagnosis --methods $methods
+    once nlt compare --config leaner --out results/diagnosis --methods $methods
 fi
