@@ -36,7 +36,7 @@ def judge(method: RenderingModule, dataset: LightTransportDataset, policy: Polic
     metrics = ImageMetrics(perceptual=False)
     with policy.applied(torch.device("cpu")):
         for batch in DataLoader(dataset, batch_size=16, collate_fn=collated):
-            metrics.update(method(batch).float(), batch["reference_a"], batch["reference_b"], batch["exposure"])
+            metrics.update(method(batch), batch["reference_a"], batch["reference_b"], batch["exposure"])
     values = metrics.compute()
     return {key: float(values[key]) for key in KEYS}
 

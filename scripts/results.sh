@@ -6,7 +6,7 @@ set -eu
 scale=${1:-small}
 mkdir -p runs/done
 once() {
-    done="runs/done/$(echo "$*" | tr ' /' '--')-$scale"
+    done="runs/done/$(echo "$* $scale" | cksum | tr ' ' -)"  # a file's name may not be as long as a command
     [ -e "$done" ] || { "$@" && touch "$done"; }
 }
 publish() {

@@ -323,8 +323,7 @@ class _Bench:
             "timed_frames": len(timed),
             "plain": summary(slow),
             "speedup": speedup | {"of_least": min(network[0]) / min(network[1])},  # other work can only slow a frame
-            "precision": _precision(clock, method),
-            "step_flops": clock.flops(method),
+            **_precision_and_flops(clock, method),
         }
 
     def _growth(self, part: Part, done: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
@@ -468,13 +467,13 @@ def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:
     return sum(seconds.get(f"{name}{suffix}", 0.0) for name in NETWORK_STAGES)
 
 
-def _precision(clock: Clock, method: RenderingModule) -> str:
-    """In which the last convolution gives its result."""
+def _precision_and_flops(clock: Clock, method: RenderingModule) -> dict[str, Any]:
+    """In which precision the last convolution gives its result, and operations by step: both of the same batch."""
     found: list[torch.dtype] = []
     hook = method.unet.conv_out.register_forward_hook(lambda _, __, output: found.append(output.dtype))
-    clock.flops(method)
+    flops = clock.flops(method)
     hook.remove()
-    return str(found[0]).removeprefix("torch.")
+    return {"precision": str(found[0]).removeprefix("torch."), "step_flops": flops}
 
 
 def _touches(factor: str, method: Method) -> bool:
