@@ -19,10 +19,13 @@ from tiny import SCALE, write
 
 from nlt.baselines.feature_projection import FeatureProjection
 from nlt.cli import main
+from nlt.data.engines import Process
+from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import advice, clock, search, trials
 from nlt.evaluation.choice import choose, paired_difference, ranked, within
+from nlt.evaluation.ladder import Ladder
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
 from nlt.paths import CONFIGS
@@ -30,6 +33,7 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import BUILTINS, mitsuba_scene
 from nlt.scenes.description import EXPERIMENTS, load_description
 from nlt.scenes.pointcloud import sample_points
+from nlt.waiting import WAIT_POLICY
 
 pytest_plugins = ["training_fixtures"]
 
@@ -255,6 +259,13 @@ class FakeTime:
         patch.setattr(search.Search, "_step_s", lambda this, module: self.per_step * module.hparams["width"])
 
 
+class Here:
+    """In place of a process: what is patched holds in it, too."""
+
+    def __init__(self, function, *arguments):
+        self.result = lambda: function(*arguments)
+
+
 @pytest.fixture
 def ladder(tiny, tmp_path, monkeypatch, one_thread):
     """Its config file; the scene is not looked at again, and the clock is brief."""
@@ -262,6 +273,8 @@ def ladder(tiny, tmp_path, monkeypatch, one_thread):
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts()])
     monkeypatch.setattr(clock, "WARM_UP", 1)
     monkeypatch.setattr(clock, "FRAMES", 3)
+    monkeypatch.setattr(search, "Process", Here)
+    monkeypatch.setenv(WAIT_POLICY, "passive")  # else it would be for the tests to come, too
     scale = merge(SCALE, {"trainer": {"max_steps": STEPS, "max_epochs": -1}})
     sizes = [str(write(tmp_path / f"{name}.yaml", {"model": {"init_args": size}})) for name, size in SIZES.items()]
     content = {
@@ -363,6 +376,15 @@ def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
     finals = [row for row in run_select(ladder) if row["steps"] == str(STEPS)]
     assert len(finals) == 3 and any(row["full"] == "1" for row in finals)
     assert sum(row["method"] == "cnn" for row in finals) == (0 if lights else 1)
+
+
+def test_frames_are_timed_in_a_process(ladder):
+    read = Ladder.load(str(ladder))
+    candidates = read.candidates[:2]
+    costs = Process(search.frame_costs, read, generate(read.spec, read.root), candidates, 1.0).result()
+    for candidate, cost in zip(candidates, costs, strict=True):
+        assert 0 < cost["time_per_frame_s"] <= cost["time_per_frame_p95_s"]
+        assert cost["parameters"] == sum(p.numel() for p in read.build(candidate).parameters())
 
 
 def newest(folder):

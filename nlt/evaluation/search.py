@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch.utils.data import default_collate
 
+from nlt.data.dataset import LightTransportDataset
+from nlt.data.engines import Process
 from nlt.data.files import write_bytes
 from nlt.errors import UserError
 from nlt.evaluation.choice import ranked
@@ -83,6 +86,7 @@ class Search:
             write_bytes(file, json.dumps(self._plan()).encode())
         plan = json.loads(file.read_text())
         self.rungs, self.spent = plan["rungs"], plan["spent_s"]
+        torch.set_num_threads(plan["threads"])
         costs = dict(zip(self.ladder.candidates, plan["costs"], strict=False))
         self.entries = {candidate: Entry(candidate, cost) for candidate, cost in costs.items()}
         order = list(self.entries)
@@ -99,12 +103,11 @@ class Search:
     def _plan(self) -> dict[str, Any]:
         """The steps of the rungs, and what every candidate costs: per step, and per frame with all taking turns."""
         begin, rungs = now(), self._steps(self._most)
-        modules: dict[Candidate, RenderingModule] = {}
+        threads = self._set_fastest_threads()
         for candidate in self.ladder.candidates:
-            if now() - begin > _TIMING * self.budget and len(modules) >= 2:
+            if now() - begin > _TIMING * self.budget and len(self.entries) >= 2:
                 break
-            modules[candidate] = self.ladder.build(candidate)
-            self.entries[candidate] = Entry(candidate, {"step_s": self._step_s(modules[candidate])})
+            self.entries[candidate] = Entry(candidate, {"step_s": self._step_s(self.ladder.build(candidate))})
         order, enough = list(self.entries), min(_ENOUGH, len(self.entries))
         self.spent = now() - begin + _TIMING * self.budget
         while not self._fits(order, enough, rungs) and rungs[-1] > self._epoch:
@@ -112,12 +115,19 @@ class Search:
         if not self._fits(order, 2, rungs):
             minutes = math.ceil(2 * (self.spent + self._cost(order[:2], rungs)) / 60)
             raise UserError(f"--minutes: {self.ladder.minutes:g} are too few for two candidates; give {minutes}")
-        clock = Clock(Frames(self.trials.split("val")), self.device)
-        laps = clock.race({c.slug: modules[c] for c in self.entries}, _TIMING * self.budget)
-        for entry in self.entries.values():
-            entry.cost |= summary(laps[entry.candidate.slug]) | clock.size(modules[entry.candidate])
-        costs = [entry.cost for entry in self.entries.values()]
-        return {"rungs": rungs, "costs": costs, "spent_s": now() - begin}
+        frames = Process(frame_costs, self.ladder, self.trials.dataset, order, _TIMING * self.budget).result()
+        costs = [self.entries[candidate].cost | frame for candidate, frame in zip(order, frames, strict=True)]
+        return {"rungs": rungs, "costs": costs, "spent_s": now() - begin, "threads": threads}
+
+    def _set_fastest_threads(self) -> int:
+        """Train with one thread or with all: on a busy machine all are slower, for they wait for one another."""
+        seconds = {}
+        for threads in (1, torch.get_num_threads()):
+            torch.set_num_threads(threads)
+            seconds[threads] = self._step_s(self.ladder.build(self.ladder.full))
+        threads = min(seconds, key=seconds.__getitem__)
+        torch.set_num_threads(threads)
+        return threads
 
     def _steps(self, last: int) -> list[int]:
         """Steps of the rungs, each a third of the next, in whole epochs: so going on is exact."""
@@ -259,3 +269,11 @@ class Search:
     def errors(self, candidates: list[Candidate], key: str) -> dict[Candidate, np.ndarray]:
         """Scores of candidates that were trained with all `seeds`, as errors: the lower the better."""
         return {c: as_error(key, self.scores(c, key, self.seeds)) for c in candidates}
+
+
+def frame_costs(ladder: Ladder, dataset: Any, candidates: list[Candidate], seconds: float) -> list[dict[str, Any]]:
+    """What a frame of each candidate takes, all taking turns for `seconds`, and its sizes."""
+    modules = {candidate.slug: ladder.build(candidate) for candidate in candidates}
+    clock = Clock(Frames(LightTransportDataset(dataset, ladder.spec, "val")), default_device())
+    laps = clock.race(modules, seconds)
+    return [summary(laps[slug]) | clock.size(module) for slug, module in modules.items()]

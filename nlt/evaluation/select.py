@@ -22,6 +22,7 @@ from nlt.evaluation.search import Search
 from nlt.evaluation.selection import draw_front, markdown
 from nlt.evaluation.trials import SCORES, as_error
 from nlt.metrics.quantities import COSTS
+from nlt.waiting import wait_passively
 
 Row = dict[str, Any]
 # What each row of confirmed.csv is.
@@ -35,6 +36,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
         UserError: the config is wrong, or the minutes are too few.
     """
     start, begun = time.time(), origin()
+    wait_passively()  # where frames are timed; this process, which trains, has loaded torch and goes on spinning
     ladder = Ladder.load(config, minutes)
     facts = advice.measure_facts(ladder.spec)
     advised = advice.advise(ladder.spec, facts)
