@@ -473,6 +473,8 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
     assert re.search(r"^(\S+) trainings: 2 training, ETA \1$", shown(cnn={**step, "step": 100}), re.MULTILINE)
     assert "  cnn, seed 0  done" in shown(cnn={"done": True})
     assert "  nlt, seed 0  failed    exit code -9" in shown({tmp_path / "nlt": "exit code -9"})
+    begun = progress._Row(progress._TRAINING, steps=100)  # before its first step
+    assert str(begun).split() == ["training", "step", "0", "of", "100", "loss", "?", "ETA", "?"]
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,8 @@ class _Row:
         if self.state != _TRAINING:
             return f"{self.state:9} {self.message}".rstrip()
         eta = "?" if math.isnan(self.eta_s) else tqdm.format_interval(self.eta_s)
-        return f"{self.state:9} step {self.step:6} of {self.steps:<7g} loss {self.loss:<9.4g} ETA {eta}"
+        loss = "?" if math.isnan(self.loss) else f"{self.loss:.4g}"  # before the first step there is none
+        return f"{self.state:9} step {self.step:6} of {self.steps:<7g} loss {loss:9} ETA {eta}"
 
 
 class ProgressTable:
