@@ -17,6 +17,8 @@ publish --config table1 --seeds 3
 publish --config ablation
 publish --config static_kitchen
 publish --config static_bathroom
+publish --config static_kitchen --data static_kitchen
+publish --config static_bathroom --data static_bathroom
 publish --config table2 --data dynamic_moving_lights
 publish --config table1 --data dynamic_fixed_lights
 once nlt stress --config table2 --scale "$scale" --views 1
