@@ -19,6 +19,7 @@ from tiny import SCALE, write
 
 from nlt.baselines.feature_projection import FeatureProjection
 from nlt.cli import main
+from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Process
 from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
@@ -381,7 +382,8 @@ def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
 def test_frames_are_timed_in_a_process(ladder):
     read = Ladder.load(str(ladder))
     candidates = read.candidates[:2]
-    costs = Process(search.frame_costs, read, generate(read.spec, read.root), candidates, 1.0).result()
+    views = LightTransportDataset(generate(read.spec, read.root), read.spec, "val")
+    costs = Process(search.frame_costs, read, views, candidates, 1.0).result()
     for candidate, cost in zip(candidates, costs, strict=True):
         assert 0 < cost["time_per_frame_s"] <= cost["time_per_frame_p95_s"]
         assert cost["parameters"] == sum(p.numel() for p in read.build(candidate).parameters())

@@ -115,7 +115,7 @@ class Search:
         if not self._fits(order, 2, rungs):
             minutes = math.ceil(2 * (self.spent + self._cost(order[:2], rungs)) / 60)
             raise UserError(f"--minutes: {self.ladder.minutes:g} are too few for two candidates; give {minutes}")
-        frames = Process(frame_costs, self.ladder, self.trials.dataset, order, _TIMING * self.budget).result()
+        frames = Process(frame_costs, self.ladder, self.trials.split("val"), order, _TIMING * self.budget).result()
         costs = [self.entries[candidate].cost | frame for candidate, frame in zip(order, frames, strict=True)]
         return {"rungs": rungs, "costs": costs, "spent_s": now() - begin, "threads": threads}
 
@@ -271,9 +271,11 @@ class Search:
         return {c: as_error(key, self.scores(c, key, self.seeds)) for c in candidates}
 
 
-def frame_costs(ladder: Ladder, dataset: Any, candidates: list[Candidate], seconds: float) -> list[dict[str, Any]]:
+def frame_costs(
+    ladder: Ladder, dataset: LightTransportDataset, candidates: list[Candidate], seconds: float
+) -> list[dict[str, Any]]:
     """What a frame of each candidate takes, all taking turns for `seconds`, and its sizes."""
     modules = {candidate.slug: ladder.build(candidate) for candidate in candidates}
-    clock = Clock(Frames(LightTransportDataset(dataset, ladder.spec, "val")), default_device())
+    clock = Clock(Frames(dataset), default_device())
     laps = clock.race(modules, seconds)
     return [summary(laps[slug]) | clock.size(module) for slug, module in modules.items()]
