@@ -103,7 +103,7 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "report":
         from nlt.evaluation.report import draw
 
-        draw(options.directory)
+        draw(options.directory, options.megabytes)
     elif options.command == "dashboard":
         from nlt.evaluation.dashboard import dashboard
 
@@ -239,6 +239,7 @@ def _parser() -> argparse.ArgumentParser:
         "--advice", action="store_true", help="only say what varies in the scene, and so what is needed; train nothing"
     )
     report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
+    report.add_argument("--megabytes", type=_positive, help="of report.html, at most: fewer images (default: 25)")
     board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
     board.add_argument("--port", type=_whole, default=6006, help="of the server (default: 6006; 0 takes a free one)")
     for command in (report, board):

@@ -34,7 +34,7 @@ from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
 PAGE = "report.html"
 _PARTS = Path(__file__).parent / "page"
-_SIZE = 25_000_000  # bytes of the file, at most
+_MEGABYTES = 25  # of the file, at most
 _OTHER = 500_000  # of these, for what describes the images and the methods
 _AXES = ("time_per_frame_s", "flops", "parameters", "peak_memory_bytes")
 _RUN = ("seed", "status", "message", "steps", "trained_at_commit", "run")
@@ -47,8 +47,13 @@ _STRESS_FILES = (ROWS, BREAKING, TRAININGS, TEXT, "manifest.json")
 _WEBP = 90  # quality of pixel figures, which lie beside the report as they are
 
 
-def write_page(results: Results, claims: list[Claim]) -> None:
-    """Write report.html from the stored results, what they say of the claims, and the figures beside them."""
+def write_page(results: Results, claims: list[Claim], megabytes: float | None = None) -> None:
+    """Write report.html from the stored results, what they say of the claims, and the figures beside them.
+
+    Images are as many and as precise as `megabytes` (10^6 bytes; default: 25) of the file leave room for; of one view
+    at least.
+    """
+    megabytes = megabytes or _MEGABYTES
     manifest = results.manifest
     title = str(manifest.get("comparison", "Comparison"))
     if manifest["table"]:
@@ -66,7 +71,7 @@ def write_page(results: Results, claims: list[Claim]) -> None:
         "stress": _stress(results.directory / STRESS),
         "provenance": _provenance(results),
     }
-    packed, data = _images(results, _SIZE - sum(map(len, parts.values())) - _OTHER)
+    packed, data = _images(results, int(megabytes * 1e6) - sum(map(len, parts.values())) - _OTHER)
     data |= {"methods": _methods(results), "curves": curves(results), "quantities": _quantities(results)}
     data |= {"stages": list(STAGES), "devices": results.devices}
     images = "\n".join(
@@ -74,7 +79,7 @@ def write_page(results: Results, claims: list[Claim]) -> None:
         for k, view in enumerate(packed)
     )
     page = Template((_PARTS / "template.html").read_text())
-    text = page.substitute(parts, precision=_precision(results, data), data=_json(data), images=images)
+    text = page.substitute(parts, precision=_precision(results, data, megabytes), data=_json(data), images=images)
     write_bytes(results.directory / PAGE, text.encode())
 
 
@@ -408,13 +413,11 @@ def _margin(comparison: Comparison) -> str:
     return f"{comparison.margin:+.3g} [{comparison.low:+.3g}, {comparison.high:+.3g}]"
 
 
-def _precision(results: Results, data: dict[str, Any]) -> str:
+def _precision(results: Results, data: dict[str, Any], megabytes: float) -> str:
     if not data["views"]:
         return "No images are stored beside these results; the machine that made them has them, in images/."
     error = max_error(data["dropped"])
-    some = (
-        f"{len(data['views'])} of {data['stored']} stored views, so that this file stays below {_SIZE / 1e6:.0f} MB; "
-    )
+    some = f"{len(data['views'])} of {data['stored']} stored views, so that this file stays below {megabytes:g} MB; "
     return (
         (some if len(data["views"]) < data["stored"] else f"{data['stored']} views; ")
         + f"linear radiance within {100 * error:.2g} % ({255 * 1.055 / 2.4 * error:.2g} of 255 levels as displayed); "

@@ -15,8 +15,8 @@ from nlt.evaluation.stress_report import STRESS
 from nlt.evaluation.tables import write_tables
 
 
-def draw(directory: str | Path) -> None:
-    """Tables, figures and report.html of the results in a directory.
+def draw(directory: str | Path, megabytes: int | None = None) -> None:
+    """Tables, figures and report.html, of at most so many megabytes, of the results in a directory.
 
     Raises:
         UserError: there are none.
@@ -33,4 +33,4 @@ def draw(directory: str | Path) -> None:
         draw_qualitative(images)
         draw_failures(images)
     draw_stress(results.directory / STRESS)
-    write_page(results, claims)
+    write_page(results, claims, megabytes)
