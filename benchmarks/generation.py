@@ -36,7 +36,7 @@ from nlt.data.engines import Process, cores
 from nlt.data.generate import generate, render_shard
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.evaluation.bare import Bare
+from nlt.evaluation.bench.bare import Bare
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.paths import PROJECT
 from nlt.scenes.assembly import load_source

@@ -92,20 +92,20 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "bench":
         _bench(options)
     elif options.command == "select":
-        from nlt.evaluation.select import select
+        from nlt.evaluation.select.run import select
 
         select(options.config, options.minutes, options.out, options.advice)
     elif options.command == "stress":
-        from nlt.evaluation.stress import stress
+        from nlt.evaluation.stress.run import stress
 
         how = (options.methods, options.suites, options.manifest, options.views)
         stress(options.config, options.out, options.scale, options.data, *how)
     elif options.command == "report":
-        from nlt.evaluation.report import draw
+        from nlt.evaluation.drawing.report import draw
 
         draw(options.directory, options.megabytes)
     elif options.command == "dashboard":
-        from nlt.evaluation.dashboard import dashboard
+        from nlt.evaluation.drawing.dashboard import dashboard
 
         dashboard(options.directory, options.port)
     elif options.command == "scenes":
@@ -119,7 +119,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    from nlt.evaluation.bench import bench
+    from nlt.evaluation.bench.run import bench
 
     bench(
         out=options.out,

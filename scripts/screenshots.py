@@ -12,9 +12,9 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 from tensorboard import program
 
-from nlt.evaluation.dashboard import write_logs
-from nlt.evaluation.page import PAGE
-from nlt.evaluation.report import draw
+from nlt.evaluation.drawing.dashboard import write_logs
+from nlt.evaluation.drawing.page import PAGE
+from nlt.evaluation.drawing.report import draw
 from nlt.evaluation.results import load
 
 

@@ -12,7 +12,9 @@ from tiny import DATASET, SCALE, write
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
-from nlt.evaluation import bench, ceilings, clock
+from nlt.evaluation import clock
+from nlt.evaluation.bench import ceilings
+from nlt.evaluation.bench import run as bench
 from nlt.evaluation.comparison import untrained
 from nlt.evaluation.frames import Frames
 from nlt.metrics.quantities import NETWORK_STAGES, STAGES

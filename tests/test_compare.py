@@ -28,13 +28,14 @@ from nlt.data import engines
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import clock, compare, comparison, learning_curves, progress
-from nlt.evaluation.dashboard import write_logs
+from nlt.evaluation import clock, compare, comparison, progress
+from nlt.evaluation.drawing import learning_curves
+from nlt.evaluation.drawing.dashboard import write_logs
+from nlt.evaluation.drawing.gallery import Shown, worst_pixels
+from nlt.evaluation.drawing.report import draw
 from nlt.evaluation.frames import Frames
-from nlt.evaluation.gallery import Shown, worst_pixels
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin
-from nlt.evaluation.report import draw
 from nlt.evaluation.results import load, write_images, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.module import RenderingModule

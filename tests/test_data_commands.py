@@ -162,7 +162,7 @@ def test_stats(dataset, tmp_path, monkeypatch, capfd):
 def test_show(dataset, tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from nlt.evaluation import figures
+    from nlt.evaluation.drawing import figures
 
     drawn = []
     monkeypatch.setattr(figures.plt, "close", drawn.append)

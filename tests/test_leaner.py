@@ -9,7 +9,7 @@ from made_results import make_results
 from scipy import stats
 
 from nlt.errors import UserError
-from nlt.evaluation.figures import curves, draw_speed_accuracy
+from nlt.evaluation.drawing.figures import curves, draw_speed_accuracy
 from nlt.evaluation.results import load, write_manifest
 from nlt.paths import PROJECT
 

@@ -23,7 +23,7 @@ from nlt.data import generate as generation
 from nlt.data.spec import load_spec
 from nlt.data.suites import load_suites
 from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.ladder import Ladder
+from nlt.evaluation.select.ladder import Ladder
 from nlt.metrics import quantities
 from nlt.paths import PROJECT, find_config
 from nlt.rendering.renderer import Renderer

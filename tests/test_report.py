@@ -17,13 +17,13 @@ from made_results import ODD, TROUBLED, make_results, make_troubled_results, pap
 from matplotlib import colormaps
 from playwright.sync_api import sync_playwright
 
-from nlt.evaluation import page as report_page
 from nlt.evaluation.claims import write_claims
-from nlt.evaluation.gallery import Shown, draw_failures
-from nlt.evaluation.packing import COARSEST, max_error, pack, pack_to_fit
+from nlt.evaluation.drawing import page as report_page
+from nlt.evaluation.drawing.gallery import Shown, draw_failures
+from nlt.evaluation.drawing.packing import COARSEST, max_error, pack, pack_to_fit
+from nlt.evaluation.drawing.tables import write_tables
 from nlt.evaluation.paper import label, published
 from nlt.evaluation.results import load, write_rows
-from nlt.evaluation.tables import write_tables
 from nlt.metrics.display import display
 from nlt.metrics.quantities import QUANTITIES
 

@@ -24,9 +24,10 @@ from nlt.data.engines import Process
 from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, merge
-from nlt.evaluation import advice, clock, search, trials
-from nlt.evaluation.choice import choose, paired_difference, ranked, within
-from nlt.evaluation.ladder import Ladder
+from nlt.evaluation import clock
+from nlt.evaluation.select import advice, search, trials
+from nlt.evaluation.select.choice import choose, paired_difference, ranked, within
+from nlt.evaluation.select.ladder import Ladder
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
 from nlt.paths import CONFIGS

@@ -24,12 +24,12 @@ from nlt.data.stage import PLACES, Stage
 from nlt.data.stress import rungs
 from nlt.data.suites import load_suites
 from nlt.errors import UserError
-from nlt.evaluation.changed_inputs import BUDGET, FRAME
-from nlt.evaluation.page import write_page
+from nlt.evaluation.drawing.page import write_page
+from nlt.evaluation.drawing.stress_figures import draw_stress
+from nlt.evaluation.drawing.stress_report import breaking_point
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import read_rows, write_manifest, write_rows
-from nlt.evaluation.stress_figures import draw_stress
-from nlt.evaluation.stress_report import breaking_point
+from nlt.evaluation.stress.inputs import BUDGET, FRAME
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
 from nlt.paths import CONFIGS
@@ -414,6 +414,6 @@ def test_again_changes_nothing(stressed, monkeypatch):
     names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.png")
     before = {name: (stressed.directory / name).read_bytes() for name in names}
     monkeypatch.setattr("nlt.data.stress.Local", None)
-    monkeypatch.setattr("nlt.evaluation.stress_views.SuiteViews.judge", None)
+    monkeypatch.setattr("nlt.evaluation.stress.views.SuiteViews.judge", None)
     assert main(stressed.command) == 0
     assert {name: (stressed.directory / name).read_bytes() for name in names} == before

@@ -17,10 +17,11 @@ from nlt.data.spec import load_spec, read_configs
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.clock import Clock
 from nlt.evaluation.comparison import Comparison, untrained
+from nlt.evaluation.drawing.report import draw
+from nlt.evaluation.drawing.tables import live_header, live_row, write_tables
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin, surroundings
-from nlt.evaluation.report import draw
 from nlt.evaluation.results import (
     DIVERGED,
     FAILED,
@@ -35,7 +36,6 @@ from nlt.evaluation.results import (
     write_rows,
     write_timings,
 )
-from nlt.evaluation.tables import live_header, live_row, write_tables
 from nlt.evaluation.trainings import Training, check, train
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule

@@ -176,7 +176,7 @@ def _fit(training: Training, progress: Progress) -> dict[str, Any]:
 
 
 def _run_config(training: Training) -> dict[str, Any]:
-    # Hyperparameters are logged when the metrics are known: nlt/evaluation/dashboard.py.
+    # Hyperparameters are logged when the metrics are known: nlt/evaluation/drawing/dashboard.py.
     logger = {"save_dir": str(training.run), "name": "", "version": "", "default_hp_metric": False}
     trainer = read_configs(list(training.files)).get("trainer") or {}
     return {

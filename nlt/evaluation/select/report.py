@@ -9,9 +9,9 @@ from typing import Any
 
 import matplotlib
 
-from nlt.evaluation.figures import COLOURS, HALO, MARKERS, pareto_front, save
+from nlt.evaluation.drawing.figures import COLOURS, HALO, MARKERS, pareto_front, save
+from nlt.evaluation.drawing.tables import heading, text
 from nlt.evaluation.paper import label
-from nlt.evaluation.tables import heading, text
 from nlt.metrics.quantities import QUANTITIES
 
 matplotlib.use("Agg")

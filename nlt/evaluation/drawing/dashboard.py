@@ -19,9 +19,9 @@ from tensorboard.plugins.hparams import summary_v2 as hp  # api imports TensorFl
 from torch.utils.tensorboard import SummaryWriter
 
 from nlt.errors import UserError
+from nlt.evaluation.drawing.tables import COLUMNS, heading
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import OK, Results, load
-from nlt.evaluation.tables import COLUMNS, heading
 from nlt.metrics.quantities import METRICS
 
 LOGS = "tensorboard"

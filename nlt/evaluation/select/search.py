@@ -20,11 +20,11 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Process
 from nlt.data.files import write_bytes
 from nlt.errors import UserError
-from nlt.evaluation.choice import ranked
 from nlt.evaluation.clock import Clock, summary
 from nlt.evaluation.frames import Frames
-from nlt.evaluation.ladder import Candidate, Ladder
-from nlt.evaluation.trials import SCORES, Trials, as_error
+from nlt.evaluation.select.choice import ranked
+from nlt.evaluation.select.ladder import Candidate, Ladder
+from nlt.evaluation.select.trials import SCORES, Trials, as_error
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
 

@@ -18,7 +18,7 @@ from nlt.data.dataset import LightTransportDataset, collated
 from nlt.data.files import write_bytes
 from nlt.data.spec import merge
 from nlt.errors import DivergedError
-from nlt.evaluation.ladder import Candidate, Ladder
+from nlt.evaluation.select.ladder import Candidate, Ladder
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from nlt.evaluation.claims import text, write_claims
-from nlt.evaluation.figures import draw_samples, draw_speed_accuracy
-from nlt.evaluation.gallery import Shown, draw_failures, draw_qualitative
-from nlt.evaluation.learning_curves import draw_learning_curves
-from nlt.evaluation.page import write_page
+from nlt.evaluation.drawing.figures import draw_samples, draw_speed_accuracy
+from nlt.evaluation.drawing.gallery import Shown, draw_failures, draw_qualitative
+from nlt.evaluation.drawing.learning_curves import draw_learning_curves
+from nlt.evaluation.drawing.page import write_page
+from nlt.evaluation.drawing.stress_figures import draw_stress
+from nlt.evaluation.drawing.stress_report import STRESS
+from nlt.evaluation.drawing.tables import write_tables
 from nlt.evaluation.results import load
-from nlt.evaluation.stress_figures import draw_stress
-from nlt.evaluation.stress_report import STRESS
-from nlt.evaluation.tables import write_tables
 
 
 def draw(directory: str | Path, megabytes: int | None = None) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.figures import COLOURS, MARKERS, plt, save
+from nlt.evaluation.drawing.figures import COLOURS, MARKERS, plt, save
 from nlt.evaluation.paper import label
 from nlt.metrics.quantities import STAGES
 

@@ -18,7 +18,7 @@ from nlt.data.store import Points, read_points
 from nlt.data.stress import DRAWS, Rung, RungViews, rungs
 from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
 from nlt.errors import UserError
-from nlt.evaluation.changed_inputs import BUDGET, FRAME
+from nlt.evaluation.stress.inputs import BUDGET, FRAME
 from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method

@@ -2,7 +2,7 @@
 
 results/NAME/stress/ holds `stress.csv`, a row per method, suite, ladder, severity and view; `manifest.json`, with the
 manifest of the suites in it; and, outside git, `images/SUITE-METHOD.npz`, the radiance of a suite's highest
-severities. Everything else there is made from these: nlt/evaluation/stress_report.py.
+severities. Everything else there is made from these: nlt/evaluation/drawing/stress_report.py.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from nlt.data.stage import PLACES, lacks
 from nlt.data.stress import render_suites
 from nlt.data.suites import CLEAN, COMPUTED, FLICKER, SUITES, TRAINING, Suites, load_suites
 from nlt.errors import DivergedError, UserError
-from nlt.evaluation.changed_inputs import BUDGET, FRAME
 from nlt.evaluation.claims import write_claims
 from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.page import write_page
+from nlt.evaluation.drawing.page import write_page
+from nlt.evaluation.drawing.stress_figures import draw_stress
+from nlt.evaluation.drawing.stress_report import ROWS, STRESS, TRAININGS
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
-from nlt.evaluation.stress_figures import draw_stress
-from nlt.evaluation.stress_report import ROWS, STRESS, TRAININGS
-from nlt.evaluation.stress_training import train_suite
-from nlt.evaluation.stress_views import SuiteViews
+from nlt.evaluation.stress.inputs import BUDGET, FRAME
+from nlt.evaluation.stress.trainings import train_suite
+from nlt.evaluation.stress.views import SuiteViews
 from nlt.evaluation.trainings import Training, check, train
 from nlt.models.policy import Policy, default_device
 

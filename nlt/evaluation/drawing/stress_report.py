@@ -14,9 +14,9 @@ import scipy.stats
 
 from nlt.data.files import write_bytes
 from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
+from nlt.evaluation.drawing.tables import Table, as_markdown
 from nlt.evaluation.paper import label, order
 from nlt.evaluation.results import MANIFEST, OK, read_rows, write_rows
-from nlt.evaluation.tables import Table, as_markdown
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
 DOUBLED = 2.0  # times the clean error: broken

@@ -14,9 +14,9 @@ import torch
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
+from nlt.evaluation.drawing.tables import heading
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import OK, Results
-from nlt.evaluation.tables import heading
 from nlt.metrics.display import display
 from nlt.metrics.quantities import METRICS
 from nlt.models.method import Batch

@@ -17,8 +17,8 @@ from nlt.data.files import write_bytes
 from nlt.data.spec import merge, read_configs
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison, untrained
+from nlt.evaluation.drawing.stress_report import STRESS, TRAININGS
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
-from nlt.evaluation.stress_report import STRESS, TRAININGS
 from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule

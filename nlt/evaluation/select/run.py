@@ -13,14 +13,14 @@ import yaml
 
 from nlt.data.files import write_bytes
 from nlt.data.generate import generate
-from nlt.evaluation import advice
-from nlt.evaluation.choice import choose, paired_difference
-from nlt.evaluation.ladder import Candidate, Ladder
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
-from nlt.evaluation.search import Search
-from nlt.evaluation.selection import draw_front, markdown
-from nlt.evaluation.trials import SCORES, as_error
+from nlt.evaluation.select import advice
+from nlt.evaluation.select.choice import choose, paired_difference
+from nlt.evaluation.select.ladder import Candidate, Ladder
+from nlt.evaluation.select.report import draw_front, markdown
+from nlt.evaluation.select.search import Search
+from nlt.evaluation.select.trials import SCORES, as_error
 from nlt.metrics.quantities import COSTS
 from nlt.waiting import wait_passively
 

@@ -10,10 +10,10 @@ import matplotlib
 import numpy as np
 
 from nlt.data.suites import RENDERED
-from nlt.evaluation.figures import COLOURS, DASHES, MARKERS, grid, save, shown
+from nlt.evaluation.drawing.figures import COLOURS, DASHES, MARKERS, grid, save, shown
+from nlt.evaluation.drawing.stress_report import DOUBLED, Stressed, breaking_point, load_stress, severity, write_stress
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import IMAGES
-from nlt.evaluation.stress_report import DOUBLED, Stressed, breaking_point, load_stress, severity, write_stress
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

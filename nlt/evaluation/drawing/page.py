@@ -22,14 +22,23 @@ from PIL import Image
 from nlt.data.files import write_bytes
 from nlt.evaluation.claims import Claim, Comparison
 from nlt.evaluation.claims import text as claim_text
-from nlt.evaluation.figures import bar, curves
-from nlt.evaluation.gallery import FAILURES, Shown, failures
-from nlt.evaluation.packing import max_error, pack_to_fit
+from nlt.evaluation.drawing.figures import bar, curves
+from nlt.evaluation.drawing.gallery import FAILURES, Shown, failures
+from nlt.evaluation.drawing.packing import max_error, pack_to_fit
+from nlt.evaluation.drawing.stress_report import (
+    BREAKING,
+    ROWS,
+    STRESS,
+    TEXT,
+    TRAININGS,
+    introduction,
+    load_stress,
+    paragraphs,
+)
+from nlt.evaluation.drawing.stress_report import tables as stress_tables
+from nlt.evaluation.drawing.tables import Table, heading, tables, text
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
-from nlt.evaluation.stress_report import BREAKING, ROWS, STRESS, TEXT, TRAININGS, introduction, load_stress, paragraphs
-from nlt.evaluation.stress_report import tables as stress_tables
-from nlt.evaluation.tables import Table, heading, tables, text
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
 
 PAGE = "report.html"

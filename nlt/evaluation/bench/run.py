@@ -30,9 +30,9 @@ from nlt.data.spec import DatasetSpec, load_spec, read_configs
 from nlt.data.stats import laps, timed_spp
 from nlt.data.store import missing_files, write_manifest, write_shard
 from nlt.errors import UserError
-from nlt.evaluation import ceilings
-from nlt.evaluation.bare import Bare
-from nlt.evaluation.bench_report import BENCH, write_report
+from nlt.evaluation.bench import ceilings
+from nlt.evaluation.bench.bare import Bare
+from nlt.evaluation.bench.report import BENCH, write_report
 from nlt.evaluation.clock import LEAST_FRAMES, Clock, summary
 from nlt.evaluation.comparison import untrained
 from nlt.evaluation.frames import Frames

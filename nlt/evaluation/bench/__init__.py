@@ -1,0 +1,1 @@
+"""`nlt bench`: what a frame, a training step and a sample cost."""

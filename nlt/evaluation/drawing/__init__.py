@@ -1,0 +1,1 @@
+"""Tables, figures, report.html and dashboard, from stored results alone."""

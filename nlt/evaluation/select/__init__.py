@@ -1,0 +1,1 @@
+"""`nlt select`: the smallest model that a scene needs."""

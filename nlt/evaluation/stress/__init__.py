@@ -1,0 +1,1 @@
+"""`nlt stress`: where methods break."""
