@@ -14,20 +14,24 @@ publish() {
 }
 publish --config table2 --seeds 3
 publish --config table1 --seeds 3
-publish --config ablation
+publish --config ablation --seeds 3
+publish --config ablation --data real/static_egg --seeds 3
 publish --config static_kitchen
 publish --config static_bathroom
 publish --config static_kitchen --data static_kitchen
 publish --config static_bathroom --data static_bathroom
-publish --config table2 --data dynamic_moving_lights
-publish --config table1 --data dynamic_fixed_lights
+publish --config table2 --data dynamic_moving_lights --seeds 3
+publish --config table1 --data dynamic_fixed_lights --seeds 3
 once nlt stress --config table2 --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
-    methods=
-    for method in cnn feature_projection nlt_photons; do
-        methods="$methods $method $method@unclipped $method@iterations_1600"
-    done
-    once nlt compare --config leaner --out results/diagnosis --methods $methods
+    once nlt compare --config diagnosis
+    once nlt compare --config diagnosis --scale leaner_128 --methods path_tracing_1 denoising_1_1 denoising_1_16 \
+        denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
+    once nlt bench --methods denoising_1_1 denoising_1_32 nlt_photons --growth denoising_1_1 denoising_1_32 nlt_photons \
+        --seconds 4 --out results/bench/growth
 fi
+for report in results/*/report.html; do
+    nlt report "$(dirname "$report")" --megabytes 8
+done

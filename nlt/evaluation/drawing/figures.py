@@ -162,7 +162,7 @@ def draw_speed_accuracy(results: Results) -> None:
     axes = np.stack([block.subplots(2, columns, squeeze=False).ravel() for block in blocks])
     for device, block, row in zip(seconds, blocks, axes, strict=True):
         block.suptitle(f"Timed on {device}" if device else "", fontsize=10)
-        block.subplots_adjust(0.14 / columns, 0.08, 1 - 0.03 / columns, 0.9, 0.18, 0.38)
+        block.subplots_adjust(0.18 / columns, 0.08, 1 - 0.03 / columns, 0.9, 0.18, 0.38)
         for axis, key, first in zip(row, panels, axes[0], strict=False):
             at = {m: (1e3 * time, results.mean(m, key)) for m, time in seconds[device].items()}
             _speed_accuracy(axis, results, key, {m: place for m, place in at.items() if math.isfinite(place[1])})
