@@ -15,7 +15,7 @@ publish() {
 publish --config table2 --seeds 3
 publish --config table1 --seeds 3
 publish --config ablation --seeds 3
-publish --config ablation --data real/static_egg --seeds 3
+publish --config ablation --data real/static_egg
 publish --config static_kitchen
 publish --config static_bathroom
 publish --config static_kitchen --data static_kitchen
