@@ -54,8 +54,8 @@ def test_one_seed_says_nothing_of_noise(tmp_path):
 def test_sizes_are_curves(results):
     """A line for each method, the fastest first."""
     assert curves(results) == {
-        "Ours (w/ photons), sizes": [f"nlt_photons@{size}" for size in MSE],
-        "CNN only, sizes": [f"cnn@{size}" for size in MSE],
+        "Ours (w/ photons), variants": [f"nlt_photons@{size}" for size in MSE],
+        "CNN only, variants": [f"cnn@{size}" for size in MSE],
     }
     draw_speed_accuracy(results)
     assert (results.directory / "speed_accuracy.png").exists()

@@ -181,7 +181,7 @@ def test_a_scale_without_class_path_is_merged(tmp_path):
 @pytest.mark.parametrize("name", ["cnn", "nlt_photons", "leaner/photons"])
 def test_sizes(name):
     """From tiny to the paper's, which are the defaults; each has more parameters than the one before."""
-    files = {size: find_config("size", size) for size in config_names("size")}
+    files = {size: find_config("variant", size) for size in config_names("variant")}
     files = {size: file for size, file in files.items() if "width:" in file.read_text()}  # others change no network
     made = {size: build(find_config("model", name), file, {}) for size, file in files.items()}
     count = {size: sum(p.numel() for p in method.parameters()) for size, method in made.items()}

@@ -18,7 +18,7 @@ _KEYS = ("table", "data", "scale", "methods", "seed")
 
 @dataclass
 class Comparison:
-    """What a config of configs/compare asks for; METHOD@SIZE is a method in a size of configs/size.
+    """What a config of configs/compare asks for; METHOD@VARIANT is a method with what configs/variant changes.
 
     Its name says if it is at another scale or of other data.
     """
@@ -65,12 +65,14 @@ class Comparison:
         # Those in folders belong to a comparison that names them.
         wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
         for method in wanted:
-            name, _, size = method.partition("@")
-            sizes = config_names("size")
+            name, _, variant = method.partition("@")
+            variants = config_names("variant")
             if name not in known:
                 raise UserError(f"{file}: methods: no method {name!r} in configs/model; known are {', '.join(known)}")
-            if "@" in method and size not in sizes:
-                raise UserError(f"{file}: methods: no size {size!r} in configs/size; known are {', '.join(sizes)}")
+            if "@" in method and variant not in variants:
+                raise UserError(
+                    f"{file}: methods: no variant {variant!r} in configs/variant; known are {', '.join(variants)}"
+                )
         return cls(
             name="-".join(names),
             data=find_config("data", content["data"]),
@@ -87,9 +89,9 @@ class Comparison:
 
     def configs(self, method: str) -> list[str]:
         """The config files of a method's training, in order."""
-        name, _, size = method.partition("@")
-        sizes = [find_config("size", size)] if size else []
-        return [str(path) for path in (self.data, find_config("model", name), self.scale, *sizes)]
+        name, _, variant = method.partition("@")
+        variants = [find_config("variant", variant)] if variant else []
+        return [str(path) for path in (self.data, find_config("model", name), self.scale, *variants)]
 
 
 def untrained(method: str) -> Method | None:

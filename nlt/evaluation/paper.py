@@ -21,13 +21,13 @@ def tables() -> tuple[str, ...]:
 
 
 def label(method: str) -> str:
-    """The paper's name of a method; a method it lacks goes by its own. METHOD@SIZE adds the size."""
-    name, at, size = method.partition("@")
-    return paper()["labels"].get(name, name) + f", {size}" * bool(at)
+    """The paper's name of a method; a method it lacks goes by its own. METHOD@VARIANT adds the variant."""
+    name, at, variant = method.partition("@")
+    return paper()["labels"].get(name, name) + f", {variant}" * bool(at)
 
 
 def order(method: str) -> tuple[int, str]:
-    """Sort key: the paper's order, then the methods it lacks by name; sizes of one method are equal."""
+    """Sort key: the paper's order, then the methods it lacks by name; variants of one method are equal."""
     known, name = list(paper()["labels"]), method.partition("@")[0]
     return (known.index(name) if name in known else len(known), name)
 

@@ -236,22 +236,22 @@ def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, fl
 
 
 def curves(results: Results) -> dict[str, list[str]]:
-    """Sizes of one method, and classes with several methods that path trace: the methods, by what they are called.
+    """Variants of one method, and classes with several methods that path trace: the methods, by what they are called.
 
     The cheapest comes first.
     """
     families: dict[str, dict[str, tuple[float, float]]] = {}
-    sizes: dict[str, list[str]] = {}
+    variants: dict[str, list[str]] = {}
     for run in results.runs:
         if run["status"] != OK:
             continue
         name, at, _ = run["method"].partition("@")
-        if at and run["method"] not in sizes.setdefault(name, []):
-            sizes[name].append(run["method"])
+        if at and run["method"] not in variants.setdefault(name, []):
+            variants[name].append(run["method"])
         elif run["spp"] and not at:
             families.setdefault(run["family"], {})[run["method"]] = (run["spp"], run["pixel_fraction"])
     time = partial(results.mean, key="time_per_frame_s")
-    curves = {f"{label(name)}, sizes": sorted(found, key=time) for name, found in sizes.items() if len(found) > 1}
+    curves = {f"{label(name)}, variants": sorted(found, key=time) for name, found in variants.items() if len(found) > 1}
     for members in families.values():
         if len(members) > 1:
             varied = "spp" if len({spp for spp, _ in members.values()}) > 1 else "pixels traced"

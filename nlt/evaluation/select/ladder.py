@@ -70,7 +70,7 @@ class Ladder:
         for key in ("data", "scale"):
             if not isinstance(content[key], str):
                 raise UserError(f"{file}: {key}: must be the name of a config of configs/{key}, is {content[key]!r}")
-        for key, kind in (("methods", "model"), ("sizes", "size")):
+        for key, kind in (("methods", "model"), ("sizes", "variant")):
             known = config_names(kind)
             for name in _list(file, key, content[key], str):
                 if name not in known and not find_config(kind, name).is_file():
@@ -156,7 +156,7 @@ class Ladder:
         return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
 
     def _config(self, method: str, size: str) -> dict[str, Any]:
-        files = (self.data, find_config("model", method), self.scale, find_config("size", size))
+        files = (self.data, find_config("model", method), self.scale, find_config("variant", size))
         return read_configs([str(file) for file in files])
 
     def build(self, candidate: Candidate) -> RenderingModule:
