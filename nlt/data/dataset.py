@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,59 @@ from torch.utils.data import Dataset, Sampler
 from nlt.data.files import AnyPath
 from nlt.data.sample import BATCH_FIELDS
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import ShardReader, points_name, read_points
+from nlt.data.store import Points, ShardReader, points_name, read_points
 from nlt.scenes.camera import Camera
 
 _TARGETS = {"train": ("noisy",), "val": ("noisy", "reference_a", "reference_b")}
 _TARGETS["test"] = _TARGETS["val"]
+
+
+class SampleTensors:
+    """What is stored of samples, as the tensors of `FIELDS` and `BATCH_FIELDS` that a method reads.
+
+    Args:
+        spec: of the dataset.
+        points: the point cloud of each scene, by the scene's number.
+        wanted: fields to be made of what is stored, of points and camera; None for all.
+    """
+
+    def __init__(self, spec: DatasetSpec, points: Mapping[int, Points], wanted: Set[str] | None = None) -> None:
+        self._spec, self._points, self._wanted = spec, points, wanted
+        self._static = {
+            scene: {
+                "point_material": torch.from_numpy(cloud["material"].astype(np.int64)),
+                "point_albedo": torch.from_numpy(cloud["albedo"]),
+                "point_emission": torch.from_numpy(cloud["emission"]),
+            }
+            for scene, cloud in points.items()
+        }
+
+    def wants(self, name: str) -> bool:
+        """Whether a field is to be made."""
+        return self._wanted is None or name in self._wanted
+
+    def __call__(self, scene: int, stored: Mapping[str, np.ndarray], index: int = 0) -> dict[str, Tensor]:
+        """A sample of a scene; `index`: its number in the split."""
+        sample = {name: torch.from_numpy(array) for name, array in stored.items()}
+        if self.wants("view_direction"):
+            height, width = stored["noisy"].shape[-2:]
+            camera = Camera(stored["camera_matrix"], stored["world_to_view"], width, height)
+            sample["view_direction"] = torch.from_numpy(camera.view_directions())
+        sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self.wants(k)}
+        sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)
+        sample["exposure"] = torch.tensor(self._spec.descriptions[scene].exposure, dtype=torch.float32)
+        return sample
+
+    def _point_fields(self, scene: int, stored: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+        """The static points, moved and hidden as the sample's state says (supplementary, Sec. Datasets)."""
+        if "present" not in stored:
+            return {}
+        position, visible = place_points(self._points[scene], stored["translation"], stored["present"])
+        return {
+            "point_position": torch.from_numpy(position),
+            "point_visible": torch.from_numpy(visible),
+            **self._static[scene],
+        }
 
 
 class LightTransportDataset(Dataset[dict[str, Tensor]]):
@@ -33,30 +81,16 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
         self.directory, self.spec, self.split = directory, spec, split
         self._reader = ShardReader()
-        self._hold([read_points(directory / points_name(k)) for k in range(len(spec.scenes))])
+        points = {k: read_points(directory / points_name(k)) for k in range(len(spec.scenes))}
         stored = spec.fields(split)
-        self._wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
-        needed = set(stored) if self._wanted is None else self._wanted & set(stored)
-        if self._wants("view_direction"):
+        wanted = None if inputs is None else {*inputs, *_TARGETS[split]}
+        self._tensors = SampleTensors(spec, points, wanted)
+        needed = set(stored) if wanted is None else wanted & set(stored)
+        if self._tensors.wants("view_direction"):
             needed |= {"camera_matrix", "world_to_view"}
-        if any(self._wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
+        if any(self._tensors.wants(name) for name in BATCH_FIELDS if name.startswith("point_")):
             needed |= {"translation", "present"}
         self._stored = [name for name in stored if name in needed]
-
-    def _hold(self, points: list[dict[str, np.ndarray]]) -> None:
-        """The point cloud of each scene."""
-        self._points = points
-        self._static = [
-            {
-                "point_material": torch.from_numpy(cloud["material"].astype(np.int64)),
-                "point_albedo": torch.from_numpy(cloud["albedo"]),
-                "point_emission": torch.from_numpy(cloud["emission"]),
-            }
-            for cloud in points
-        ]
-
-    def _wants(self, name: str) -> bool:
-        return self._wanted is None or name in self._wanted
 
     def __len__(self) -> int:
         return len(self.spec.scenes) * self.spec.count(self.split)
@@ -67,37 +101,13 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 
     def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
         """A batch, for `torch.utils.data.DataLoader` with `collated`: every value is copied once, to where it stays."""
-        samples = [self._tensors(*self._sample(index), index) for index in indices]
-        return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
+        return collate([self._tensors(*self._sample(index), index) for index in indices])
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         """The scene of a sample, and what is stored of it."""
         scene, row = divmod(index, self.spec.count(self.split))
         shard = self.spec.shard(self.split, scene, row)
         return scene, self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
-
-    def _tensors(self, scene: int, stored: dict[str, np.ndarray], index: int) -> dict[str, Tensor]:
-        sample = {name: torch.from_numpy(array) for name, array in stored.items()}
-        if self._wants("view_direction"):
-            height, width = stored["noisy"].shape[-2:]
-            camera = Camera(stored["camera_matrix"], stored["world_to_view"], width, height)
-            sample["view_direction"] = torch.from_numpy(camera.view_directions())
-        sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self._wants(k)}
-        sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)
-        sample["exposure"] = torch.tensor(self.spec.descriptions[scene].exposure, dtype=torch.float32)
-        return sample
-
-    def _point_fields(self, scene: int, stored: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        """The static points, moved and hidden as the sample's state says (supplementary, Sec. Datasets)."""
-        if "present" not in stored:
-            return {}
-        points = self._points[scene]
-        position, visible = place_points(points, stored["translation"], stored["present"])
-        return {
-            "point_position": torch.from_numpy(position),
-            "point_visible": torch.from_numpy(visible),
-            **self._static[scene],
-        }
 
 
 def place_points(
@@ -107,6 +117,11 @@ def place_points(
     # Row -1, for what never moves, stays where it is.
     translation, present = np.concatenate([translation, np.zeros((1, 3), np.float32)]), np.append(present, True)
     return points["position"] + translation[points["object"]], present[points["object"]]
+
+
+def collate(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Samples as a batch; halves become float32."""
+    return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
 
 
 def collated(batch: Any) -> Any:

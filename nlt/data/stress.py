@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nlt.data.changed_scene import MESHES, ChangedScene
-from nlt.data.dataset import LightTransportDataset
+from nlt.data.dataset import SampleTensors, collate
 from nlt.data.engines import Local, cores
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
@@ -99,7 +99,7 @@ def render_suites(
     work = partial(_render, spec, suites, str(dataset), str(directory), choose_variant().name)
     with (
         tqdm(total=total, unit="view", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(Local(cores(), preload=(LightTransportDataset.__module__,)).run(work, _jobs(missing), died)) as ticks,
+        closing(Local(cores(), preload=(SampleTensors.__module__,)).run(work, _jobs(missing), died)) as ticks,
     ):
         for ticked in ticks:
             bar.update((ticked or 0) - bar.n)
@@ -182,35 +182,21 @@ def _points(stage: Stage, points: Points, rung: Rung) -> Points:
     return sample_points(stage.scene, spec.points, spec.seed + rung.severity)
 
 
-class RungViews(LightTransportDataset):
-    """The views of a rung, as batches hold them, with "traced_N" and, of the clean ones, "input_N".
+def read_views(
+    directory: AnyPath, spec: DatasetSpec, suites: Suites, rung: Rung, points: Points | None = None
+) -> dict[str, Tensor]:
+    """The views of a rung as a batch, with "traced_N" and, of the clean ones, "input_N"; with other points, if given.
 
     Of a draw, only what differs from the clean views.
     """
-
-    def __init__(self, directory: AnyPath, spec: DatasetSpec, suites: Suites, rung: Rung) -> None:
-        self.directory, self.spec, self.split, self.rung = directory, spec, "test", rung
-        self._wanted, self._reader = None, ShardReader()
-        self._stored = list(_DRAWN)
-        if rung.ladder != DRAWS:
-            self._stored = [*spec.fields("test"), *(f"traced_{count}" for count in suites.content["traced"])]
-        if rung.suite == CLEAN:
-            self._stored += [f"input_{count}" for count in FEWER_SPP]
-
-    def __len__(self) -> int:
-        return self.rung.views
-
-    def batch(self, points: Points | None = None) -> dict[str, Tensor]:
-        """All of them; with other points than the rung's, if given."""
-        if self.rung.ladder != DRAWS:
-            points = points or read_points(self.directory / self.rung.points_name)
-            self._hold([points] * (self.rung.scene + 1))
-        return self.__getitems__(list(range(len(self))))
-
-    def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
-        return self.rung.scene, self._reader.read(self.directory / self.rung.name, index, self._stored)
-
-    def _tensors(self, scene: int, stored: dict[str, np.ndarray], index: int) -> dict[str, Tensor]:
-        if self.rung.ladder == DRAWS:
-            return {name: torch.from_numpy(array) for name, array in stored.items()}
-        return super()._tensors(scene, stored, index)
+    names = list(_DRAWN)
+    if rung.ladder != DRAWS:
+        names = [*spec.fields("test"), *(f"traced_{count}" for count in suites.content["traced"])]
+    if rung.suite == CLEAN:
+        names += [f"input_{count}" for count in FEWER_SPP]
+    reader = ShardReader()
+    stored = [reader.read(directory / rung.name, k, names) for k in range(rung.views)]
+    if rung.ladder == DRAWS:
+        return collate([{name: torch.from_numpy(array) for name, array in view.items()} for view in stored])
+    tensors = SampleTensors(spec, {rung.scene: points or read_points(directory / rung.points_name)})
+    return collate([tensors(rung.scene, view, k) for k, view in enumerate(stored)])

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import LightTransportDataset, stack
+from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
@@ -50,7 +50,7 @@ _MOST_SPP = 4096
 _CAPTION = 20  # pixels
 
 
-class ModelRenderer(LightTransportDataset):
+class ModelRenderer:
     """Frames by a trained method. What does not depend on the camera is computed once for each of the scene's states.
 
     `scene`: which one of the spec's. Photons have the same seed in all states, so that with a light's motion they move
@@ -58,19 +58,19 @@ class ModelRenderer(LightTransportDataset):
     """
 
     def __init__(self, method: RenderingModule, spec: DatasetSpec, scene: int, device: torch.device) -> None:
-        self.spec, self.split, self.scene, self.device = spec, "test", scene, device
+        self.spec, self.scene, self.device = spec, scene, device
         self.render = SampleRenderer(spec, scene)
         self.method = method.to(device).eval()
         self.moving = MovingCamera(self.method)
-        self._wanted = {*method.inputs} - {"view_direction"}  # added here, of any size
         self._seeds = np.random.SeedSequence([_MODEL])
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
         self._of_state = {name for name in method.inputs if name.startswith("photon_")}
-        if any(name.startswith("point_") for name in method.inputs):
-            self.points = self._cloud()
-            self._hold([self.points] * (scene + 1))
+        self.points: Points = self._cloud() if any(name.startswith("point_") for name in method.inputs) else {}
+        if self.points:
             self._of_state |= {"translation", "present"}
+        wanted = {*method.inputs} - {"view_direction"}  # added here, of any size
+        self._tensors = SampleTensors(spec, {scene: self.points} if self.points else {}, wanted)
 
     def _cloud(self) -> Points:
         """The points of training, whose embeddings are learned row by row: the dataset's own where it is here."""
@@ -87,9 +87,9 @@ class ModelRenderer(LightTransportDataset):
             self._state = self.render.view(camera, self._seeds, self._of_state)
             self._key = state.key
         view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
-        tensors = self._tensors(self.scene, self._state | view, 0)
+        tensors = self._tensors(self.scene, self._state | view)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
-        batch = {name: stack([value]).to(self.device) for name, value in tensors.items()}
+        batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
         return batch | {"noisy_input": self._few_pixels(batch, camera)} if few else batch
 
     def _few_pixels(self, batch: Batch, camera: Camera) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, read_points
-from nlt.data.stress import DRAWS, Rung, RungViews, rungs
+from nlt.data.stress import DRAWS, Rung, read_views, rungs
 from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
 from nlt.errors import UserError
 from nlt.evaluation.stress.inputs import BUDGET, FRAME
@@ -52,7 +52,7 @@ class SuiteViews:
         return found
 
     def _batch(self, rung: Rung) -> Batch:
-        batch = RungViews(self.directory, self.spec, self.suites, rung).batch()
+        batch = read_views(self.directory, self.spec, self.suites, rung)
         return {name: value.to(self.device) for name, value in batch.items()}
 
     def references(self, suite: str) -> dict[str, np.ndarray]:
@@ -169,7 +169,7 @@ class SuiteViews:
         drawn = read_points(self.directory / rung.points_name)
         base = next(r for r in self.rungs if r.suite == CLEAN and r.scene == rung.scene)
         points = read_points(self.directory / base.points_name)
-        moved = RungViews(self.directory, self.spec, self.suites, base).batch(drawn)
+        moved = read_views(self.directory, self.spec, self.suites, base, drawn)
         fields = {name: value.to(self.device) for name, value in moved.items() if name.startswith("point_")}
         batch = clean | fields
         with _embeddings_of(method, rung.scene, points, drawn):
