@@ -308,7 +308,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         "--camera-path", default="turntable", help="turntable, or a YAML or JSON file of views (default: turntable)"
     )
     parser.add_argument("-o", "--output", default="video.mp4", help="NAME.mp4 or a folder (default: video.mp4)")
-    for option, default in (("--frames", 48), ("--fps", 24)):
+    for option, default in (("--frames", 36), ("--fps", 24)):
         parser.add_argument(option, type=_positive, default=default, help=f"(default: {default})")
     parser.add_argument("--resolution", type=_size, default=(256, 256), help="N or WIDTHxHEIGHT (default: 256)")
     parser.add_argument(

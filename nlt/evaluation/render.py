@@ -122,7 +122,7 @@ def render(
     state: str = "0",
     light: str | None = None,
     camera_path: str = "turntable",
-    frames: int = 48,
+    frames: int = 36,
     resolution: tuple[int, int] = (256, 256),
     fps: int = 24,
     spp: int | None = None,
