@@ -30,8 +30,6 @@ if [ "$scale" = small ]; then
     once nlt compare --config diagnosis --scale leaner_128 --methods path_tracing_1 denoising_1_1 denoising_1_16 \
         denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     once nlt compare --config diagnosis --scale leaner_3200 --methods cnn feature_projection nlt nlt_photons
-    once nlt bench --methods denoising_1_1 denoising_1_32 nlt_photons --growth denoising_1_1 denoising_1_32 nlt_photons \
-        --seconds 4 --out results/bench/growth
 fi
 for report in results/*/report.html; do
     nlt report "$(dirname "$report")" --megabytes 8
