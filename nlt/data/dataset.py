@@ -101,7 +101,7 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 
     def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
         """A batch, for `torch.utils.data.DataLoader` with `collated`: every value is copied once, to where it stays."""
-        return collate([self._tensors(*self._sample(index), index) for index in indices])
+        return as_batch([self._tensors(*self._sample(index), index) for index in indices])
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         """The scene of a sample, and what is stored of it."""
@@ -119,7 +119,7 @@ def place_points(
     return points["position"] + translation[points["object"]], present[points["object"]]
 
 
-def collate(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+def as_batch(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Samples as a batch; halves become float32."""
     return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
 

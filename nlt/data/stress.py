@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nlt.data.changed_scene import MESHES, ChangedScene
-from nlt.data.dataset import SampleTensors, collate
+from nlt.data.dataset import SampleTensors, as_batch
 from nlt.data.engines import Local, cores
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
@@ -197,6 +197,6 @@ def read_views(
     reader = ShardReader()
     stored = [reader.read(directory / rung.name, k, names) for k in range(rung.views)]
     if rung.ladder == DRAWS:
-        return collate([{name: torch.from_numpy(array) for name, array in view.items()} for view in stored])
+        return as_batch([{name: torch.from_numpy(array) for name, array in view.items()} for view in stored])
     tensors = SampleTensors(spec, {rung.scene: points or read_points(directory / rung.points_name)})
-    return collate([tensors(rung.scene, view, k) for k, view in enumerate(stored)])
+    return as_batch([tensors(rung.scene, view, k) for k, view in enumerate(stored)])

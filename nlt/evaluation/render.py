@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import SampleTensors, collate
+from nlt.data.dataset import SampleTensors, as_batch
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
@@ -89,7 +89,7 @@ class ModelRenderer:
         view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
         tensors = self._tensors(self.scene, self._state | view)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
-        batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
+        batch = {name: value.to(self.device) for name, value in as_batch([tensors]).items()}
         return batch | {"noisy_input": self._few_pixels(batch, camera)} if few else batch
 
     def _few_pixels(self, batch: Batch, camera: Camera) -> Tensor:
