@@ -41,6 +41,46 @@ def test_same_bytes_twice(dataset, tmp_path):
     assert spec_of(seed=1).directory("x") != spec_of().directory("x")
 
 
+HOLD = """
+import sys, time
+from pathlib import Path
+from nlt.data.files import _locked
+with _locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_leftovers_of_a_killed_writer(tmp_path):
+    """A writer that lives keeps its file; one that was killed does not, though nobody has reaped it yet."""
+    half = tmp_path / f".half.safetensors.{files._HOST}.1.tmp"
+    foreign = tmp_path / ".half.safetensors.elsewhere.1.tmp"
+    foreign.write_bytes(b"half")
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(half)], cwd=PROJECT, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"locked\n"
+        files.remove_leftovers(tmp_path)
+        assert half.exists()
+        writer.kill()
+        os.waitid(os.P_PID, writer.pid, os.WEXITED | os.WNOWAIT)  # dead, and still a zombie
+        os.kill(writer.pid, 0)
+        files.remove_leftovers(tmp_path)
+        assert not half.exists() and foreign.exists()
+
+
+def test_a_leftover_removed_before_it_is_locked(tmp_path, monkeypatch):
+    """The writer notices that its temporary file is gone, and opens it again."""
+    removed, lock = [], files.fcntl.flock
+
+    def removed_first(file, operation):
+        if not removed:
+            removed.append(next(tmp_path.glob(".*.tmp")).unlink())
+        lock(file, operation)
+
+    monkeypatch.setattr(files.fcntl, "flock", removed_first)
+    files.write_bytes(tmp_path / "whole", b"content")
+    assert removed and (tmp_path / "whole").read_bytes() == b"content" and len(list(tmp_path.iterdir())) == 1
+
+
 LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points": 16, "photons": 16,
         "input_spp": 1, "reference_spp": 1, "shard_size": 64}  # fmt: skip
 # The trial of the renderer before the first job would be half of the time.

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import platform
+from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import fsspec
 from upath import UPath
@@ -48,11 +51,11 @@ def write_bytes(path: AnyPath, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{_HOST}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as file:
+        with _locked(temporary) as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+            temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -61,22 +64,30 @@ def write_bytes(path: AnyPath, content: bytes) -> None:
         raise
 
 
+def _locked(temporary: Path) -> BinaryIO:
+    """Open a temporary file for writing and lock it; the lock ends with the file's closing or the process's death."""
+    while True:
+        file = temporary.open("wb")
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            if os.path.samestat(os.fstat(file.fileno()), temporary.stat()):
+                return file
+        except FileNotFoundError:
+            pass  # `remove_leftovers` came between opening and locking
+        file.close()
+
+
 def remove_leftovers(directory: AnyPath) -> None:
-    """Delete what processes of this machine that are gone were writing; another machine's may be alive."""
-    for leftover in directory.glob("**/.*.tmp") if isinstance(directory, Path) else ():
-        *_, host, pid, _ = leftover.name.split(".")
-        if host == _HOST and not _alive(int(pid)):
-            leftover.unlink(missing_ok=True)
+    """Delete the temporary files whose writers on this machine are dead.
 
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    A writer that lives holds a lock on its file. Its process id would not tell: a killed process keeps it until its
+    parent notices, and the number may be used again. Files of other machines are left alone.
+    """
+    for leftover in directory.glob(f"**/.*.{_HOST}.*.tmp") if isinstance(directory, Path) else ():
+        with suppress(OSError), leftover.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            leftover.unlink()
 
 
 def list_files(directory: AnyPath) -> set[str]:
