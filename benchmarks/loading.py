@@ -126,7 +126,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         directory = synthetic(spec, folder)
         for method in options.methods:
-            inputs = build(method, spec, 8).inputs
+            inputs = build(method, spec, 8).fields
             module = LightTransportDataModule(spec, folder, options.batch, options.workers)
             dataset = LightTransportDataset(directory, spec, "train", inputs)
             module.directory = directory

@@ -215,7 +215,7 @@ def main() -> None:
     print(f"{len(arms)} arms x {options.seeds} seeds x {options.minutes:g} min", flush=True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     module = build(config, spec, 0).to(device).eval()
-    test = LightTransportDataset(base, spec.without_train(), "test", module.inputs)
+    test = LightTransportDataset(base, spec.without_train(), "test", module.fields)
     batches = [
         {name: value.to(device) for name, value in batch.items()}
         for batch in torch.utils.data.DataLoader(test, batch_size=16, collate_fn=collated)

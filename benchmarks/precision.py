@@ -61,7 +61,7 @@ def main() -> None:
                 print(f"{training.name}: not trained; nlt compare --config {options.config} trains it", flush=True)
                 continue
             method, _ = training.load(device)
-            dataset = LightTransportDataset(directory, spec, "test", method.inputs)
+            dataset = LightTransportDataset(directory, spec, "test", method.fields)
             values = {policy: judge(method, dataset, POLICIES[policy]) for policy in POLICIES}
             row: dict[str, Any] = {"float32": values["float32"]}
             for policy in ("bfloat16", "int8"):

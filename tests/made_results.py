@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from nlt.evaluation.paper import paper
@@ -48,9 +50,11 @@ def make_results(directory, rows, table, seeds=1, over_seeds=0.0, over_views=1e-
             scale = {key: 1 + over_seeds * rng.standard_normal() for key in row}
             run = {"method": method, "seed": seed, "status": OK, "message": ""}
             run |= {key: value * scale[key] for key, value in row.items()}
-            kind = "SparseDenoising" if "denoising" in method else method.partition("_")[0]
-            one_in = int(method.rpartition("_")[2]) if "denoising" in method else 1
-            spp = int(method.rpartition("_")[2]) if "path" in method or "oidn" in method else 4 * ("denois" in method)
+            sparse = method.startswith(("denoising", "guided"))
+            kind = "SparseDenoising" if sparse else method.partition("_")[0]
+            one_in = int(method.rpartition("_")[2]) if sparse else 1
+            traced = method.startswith(("path", "oidn"))
+            spp = int(re.findall(r"\d+", method)[0]) if traced else 4 * sparse
             run |= {"time_per_frame_error_s": 1e-3 * row.get("time_per_frame_s", 0), "parameters": 1000}
             runs.append(run | {"family": kind, "pixel_fraction": 1 / one_in if spp else 0, "spp": spp})
             for view in range(VIEW_COUNT):

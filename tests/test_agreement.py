@@ -13,6 +13,7 @@ from nlt.data.spec import DatasetSpec
 from nlt.paths import scenes_root
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.assembly import Scene
+from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
 from nlt.scenes.state import sample_state, sample_view
 
@@ -156,6 +157,57 @@ def test_gbuffer_of_the_living_room():
     plain = mi.load_file(str(description.path), optimize=False)
     camera = sample_view(description, 64, np.random.default_rng(1))
     check_gbuffer(Renderer(Scene(description, "fixed_lights")), plain, camera)
+
+
+def check_emission(renderer, plain, camera):
+    """Emission is what the path tracer sees before any bounce, with 4 x 4 rays' precision where a pixel has an edge."""
+    spp, least = 4096, 1e-6
+    integrator = mi.load_dict({"type": "path", "max_depth": 1})
+    image = mi.render(plain, sensor=sensor_of(camera), integrator=integrator, spp=spp)
+    expected = np.moveaxis(np.array(image), 2, 0)[:3].astype(float)
+    ours = renderer.gbuffer(camera)["emission"].astype(float)
+    around = lambda f: np.stack([f(channel, 3) for channel in expected])
+    high, low = around(ndimage.maximum_filter), around(ndimage.minimum_filter)
+    inside = high - low < 1e-3 * high + least
+    assert np.allclose(ours[inside], expected[inside], rtol=1e-3, atol=least)
+    assert (np.abs(ours - expected) <= 0.15 * (high - low) + 1e-3 * high + least).all()
+    assert ours.sum() == pytest.approx(expected.sum(), rel=0.01)
+    lit = expected.any(0)
+    assert 0.02 < lit.mean() < 0.98 and (~inside & (expected > 0)).sum() > 20
+    assert np.abs(ours[:, :, ::-1] - expected).max() > 0.5 * high.max(), "the test cannot tell left from right"
+
+
+@pytest.mark.parametrize("experiment", ["fixed_lights", "moving_lights"])
+def test_emission_is_the_path_tracers_without_bounces(demo, experiment):
+    state = sample_state(demo, experiment, np.random.default_rng(1))
+    renderer = Renderer(Scene(demo, experiment))
+    renderer.scene.set_state(state)
+    lamp = np.array([0, demo.light.box[0, 1], 0]) if experiment == "fixed_lights" else demo.light.centre
+    if experiment == "moving_lights":
+        lamp = lamp + state.translation[-1]
+    eye = np.array([1.2, 1.0, 1.2])
+    camera = Camera.look_at(eye, lamp + np.array([0.3, 0, 0.1]), demo.up, 70, 40, 32)
+    check_emission(renderer, plain_scene(demo, experiment, state), camera)
+    below = Camera.look_at(eye, eye + np.array([0.1, -1, 0.2]), demo.up, 70, 8, 8)
+    assert not renderer.gbuffer(below)["emission"].any()
+
+
+@pytest.mark.parametrize("sky", ["envmap", "constant"])
+def test_emission_of_the_environment(tmp_path, sky):
+    """The sky past a floor, a crate and a lamp that faces down, seen from below and then from above."""
+    file = write_room(tmp_path, is_open=True)
+    mi.Bitmap(np.repeat(np.repeat(SKY, 8, 0), 8, 1) + 0.1).write(str(tmp_path / "sky.exr"))
+    value = {
+        "envmap": '<string name="filename" value="sky.exr"/>',
+        "constant": '<rgb name="radiance" value="3, 2, 1"/>',
+    }
+    source = tmp_path / "scene.xml"
+    source.write_text(source.read_text().replace("</scene>", f'<emitter type="{sky}">{value[sky]}</emitter></scene>'))
+    renderer = Renderer(Scene(load_description(str(file)), "fixed_lights"))
+    plain = mi.load_file(str(source), optimize=False)
+    for eye, target in (([0.8, 0.9, -1.6], [0, 1.2, 0]), ([0.8, 2.6, -1.6], [0, 0.6, 0])):
+        camera = Camera.look_at(np.array(eye), np.array(target), np.array([0, 1.0, 0]), 80, 40, 32)
+        check_emission(renderer, plain, camera)
 
 
 # ---- the images of samples ------------------------------------------------------------------------------

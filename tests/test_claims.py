@@ -7,8 +7,9 @@ import pytest
 import scipy.stats
 from made_results import make_results, papers_numbers
 
-from nlt.evaluation.claims import claims_of, difference, judge, write_claims
+from nlt.evaluation.claims import claims_of, difference, judge, text, write_claims
 from nlt.evaluation.paper import paper, tables
+from nlt.evaluation.results import load, write_manifest
 from nlt.metrics.quantities import QUANTITIES
 
 
@@ -92,6 +93,26 @@ def test_interval_covers(tmp_path):
         value, half = difference(results, "mse", "cnn", "nlt")
         hits += abs(value) < half
     assert scipy.stats.binomtest(hits, tries, 0.95).pvalue > 1e-3
+
+
+def test_a_difference_below_the_references_error_is_said(tmp_path):
+    """In every metric with a floor, and in no other; the verdicts stay."""
+    results = make_results(tmp_path, papers_numbers("table2"), "table2")
+    before = judge(results)
+    assert not any(c.below_floor for claim in before for c in claim.comparisons)
+    floor = {"mse": 0.004, "mssim": 0.97, "psnr": 30.0}
+    write_manifest(tmp_path, {**results.manifest, "floor": floor})
+    results = load(tmp_path)
+    after = write_claims(results)
+    assert [claim.verdict for claim in after] == [claim.verdict for claim in before]
+    least = {"mse": 0.004, "mssim": 0.03}
+    for claim in after:
+        for c in claim.comparisons:
+            gap = abs(results.mean(c.method, c.metric) - results.mean(c.other, c.metric))
+            assert c.below_floor == (gap < least.get(c.metric, 0))
+        assert text(claim).endswith("smaller than the reference's own error") == claim.weakest.below_floor
+    assert len({c.below_floor for claim in after for c in claim.comparisons if c.metric in least}) == 2
+    assert "smaller than the reference's own error" in (tmp_path / "claims.md").read_text()
 
 
 def test_the_deciding_comparison_is_shown(tmp_path):

@@ -77,7 +77,9 @@ def test_nothing_is_pickled(dataset):
 @pytest.mark.parametrize(
     "change",
     [{"resolution": 0}, {"train": -1}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
-     {"experiment": "moving"}, {"scenes": []}, {"scenes": "living_room"}, {"reference_spp": True}],
+     {"experiment": "moving"}, {"scenes": []}, {"scenes": "living_room"}, {"reference_spp": True},
+     {"reference_mse": -1e-4}, {"reference_mse": "1e-4"}, {"reference_mse": True}, {"reference_mse": float("nan")},
+     {"reference_mse": float("inf")}],
     ids=str,
 )  # fmt: skip
 def test_spec_refused(change):

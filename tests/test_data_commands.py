@@ -15,6 +15,8 @@ from safetensors.numpy import load_file, save_file
 from nlt.cli import main
 from nlt.data import stats
 from nlt.data.sample import FIELDS
+from nlt.data.spec import FORMAT
+from nlt.data.store import pilot_name, write_manifest
 
 
 @pytest.fixture
@@ -92,7 +94,7 @@ def test_everything_wrong_is_found(verify):
     points = load_file(directory / "points-000.safetensors")
     save_file({**points, "albedo": points["albedo"].astype(np.float16)}, directory / "points-000.safetensors")
     (directory / "manifest.json").write_text(
-        (directory / "manifest.json").read_text().replace('"format": 2', '"format": 7')
+        (directory / "manifest.json").read_text().replace(f'"format": {FORMAT}', '"format": 7')
     )
     code, findings, error = run()
     assert code == 2 and re.search(r"^nlt: error: .*: 12 findings; delete .*nlt generate", error)
@@ -157,6 +159,18 @@ def test_stats(dataset, tmp_path, monkeypatch, capfd):
     size = sum(stored[name][0].nbytes for name in ("camera_matrix", "world_to_view", "translation", "present"))
     size += 24 * 24 * (3 * 4 + 3 * 4 + 4 + 3 * 2 + 3 * 2) + 50 * (12 + 6 + 12 + 12 + 1)
     assert f"{(100_048 * size + 48 * 2 * 24 * 24 * 12) / 1e9:.2f} GB" in report
+
+
+def test_stats_count_the_chosen_spp(tmp_path, monkeypatch):
+    """The dataset's references as the pilot views chose, the paper's as its scale says."""
+    spec, counted = spec_of("living_room", "egg", reference_mse=1e-3, reference_spp=512), []
+    write_manifest(tmp_path, spec, "")
+    for scene, spp in enumerate((128, 32)):
+        (tmp_path / pilot_name(scene)).write_text(json.dumps({"spp": spp, "predicted_mse": 1e-3}))
+    measured = dict.fromkeys((*stats.STAGES, "start"), 1.0)
+    monkeypatch.setattr(stats, "_measure", lambda _, spp, *rest: (counted.append(spp), measured)[1])
+    stats.stats(str(tmp_path), 1)
+    assert counted == [[128, 32], [64, 64]]
 
 
 def test_show(dataset, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Generation: the same bytes however often interrupted, wherever it runs and wherever it writes to."""
 
 import errno
+import json
 import multiprocessing
 import os
 import shutil
@@ -25,6 +26,7 @@ from nlt.data import generate as generation
 from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
+from nlt.data.verify import verify
 from nlt.errors import UserError
 from nlt.paths import PROJECT
 from nlt.scenes.lanes import is_jit
@@ -80,6 +82,104 @@ def test_a_leftover_removed_before_it_is_locked(tmp_path, monkeypatch):
     files.write_bytes(tmp_path / "whole", b"content")
     assert removed and (tmp_path / "whole").read_bytes() == b"content" and len(list(tmp_path.iterdir())) == 1
 
+
+# ---- how many samples per pixel the references have -----------------------------------------------------
+
+PILOTED = {"experiment": "fixed_lights", "train": 0, "val": 2, "test": 3, "reference_spp": 100, "reference_mse": 6e-4}
+
+
+@pytest.fixture(scope="module")
+def piloted(tmp_path_factory, variant):
+    return generate(spec_of(**PILOTED), tmp_path_factory.mktemp("piloted"), workers=1)
+
+
+def as_shown(radiance, exposure):
+    x = np.clip(np.asarray(radiance, float) * exposure, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize(("most", "target"), [(4096, 1e-3), (4096, 3e-6), (1000, 1e-5), (20, 1e-3), (32, 1e-3)])
+def test_chosen_spp_by_trying_all(most, target):
+    """The first power of two, from the pilot's samples on, that brings the MSE below the target; or the most."""
+    spec = spec_of(reference_spp=most, reference_mse=target)
+    pilot = min(32, most)
+    for mse in [0.0, target, *np.random.default_rng(0).uniform(0, 20, 50) * target]:
+        enough = (2**k for k in range(5, 12) if mse * pilot / 2**k <= target and 2**k < most)
+        assert generation.needed_spp(spec, mse) == next(enough, most)
+
+
+def test_pilot_measures_the_halves_disagreement(piloted):
+    """Against numpy's mean over many pairs of halves, of the same views and rendered with other seeds."""
+    spec = spec_of(**PILOTED)
+    render, errors = SampleRenderer(spec, 0), []
+    for split, index in (("test", 0), ("test", 1), ("test", 2), ("val", 0)):
+        camera = render.place(split, index)
+        images = [as_shown(render.radiance(camera, 32, seed), render.description.exposure) for seed in range(20)]
+        errors.append(np.mean([(a - b) ** 2 for a, b in zip(images[::2], images[1::2], strict=True)]))
+    found = json.loads((piloted / store.pilot_name(0)).read_text())
+    assert found["pilot_spp"] == 32 and found["pilot_mse"] == pytest.approx(np.mean(errors), rel=0.3)
+    assert found["spp"] == generation.needed_spp(spec, found["pilot_mse"])
+    assert found["predicted_mse"] == pytest.approx(found["pilot_mse"] * 32 / found["spp"])
+
+
+def test_references_have_the_chosen_spp(piloted):
+    """The same bytes as with this number given; both splits."""
+    (reference,) = store.references(piloted, spec_of(**PILOTED))
+    assert 32 < reference["spp"] <= 100, "the target is one that the pilot's own samples do not reach"
+    render = SampleRenderer(spec_of(**{**PILOTED, "reference_spp": reference["spp"], "reference_mse": 0}), 0)
+    for split in ("test", "val"):
+        stored = store.ShardReader().read(piloted / f"{split}/000-0000000.safetensors", 1, ["reference_a"])
+        assert np.array_equal(stored["reference_a"], render.sample(split, 1, only=["reference_a"])["reference_a"])
+
+
+def _no_pilot(*_):
+    raise UserError("a second choice")
+
+
+def _stopped(*_):
+    raise KeyboardInterrupt
+
+
+def test_chosen_once(piloted, tmp_path, monkeypatch):
+    """A generation that ends after the choice goes on with it; a file that is lost is chosen again, the same."""
+    spec = spec_of(**PILOTED)
+    with monkeypatch.context() as patch:
+        patch.setattr(generation, "_announce", _stopped)
+        with pytest.raises(KeyboardInterrupt):
+            generate(spec, tmp_path, workers=1)
+    directory = spec.directory(tmp_path)
+    assert set(content(directory)) == {"manifest.json", "pilot-000.json"}
+    with monkeypatch.context() as patch:
+        patch.setattr(generation, "_pilot", _no_pilot)
+        patch.setattr(generation, "_announce", lambda *_: None)
+        generate(spec, tmp_path, workers=2)
+    assert content(directory) == content(piloted)
+    (directory / "pilot-000.json").unlink()
+    with pytest.raises(UserError, match=r"incomplete, 1 files missing, such as pilot-000.json"):
+        store.check_dataset(directory, spec)
+    monkeypatch.setattr(generation, "_run", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    generate(spec, tmp_path, workers=1)
+    assert content(directory) == content(piloted)
+
+
+def test_damaged_choice(piloted, tmp_path, capsys):
+    directory = shutil.copytree(piloted, tmp_path / piloted.name)
+    verify(str(directory))
+    (directory / "pilot-000.json").write_text('{"spp": 64}')
+    with pytest.raises(UserError, match="1 findings"):
+        verify(str(directory))
+    assert "pilot-000.json: damaged ('predicted_mse'); delete the file" in capsys.readouterr().out
+    with pytest.raises(UserError, match=r"pilot-000.json: damaged"):
+        store.references(directory, spec_of(**PILOTED))
+
+
+def test_no_pilots_without_references():
+    assert not spec_of(reference_mse=1e-4, val=0, test=0).has_pilots and not spec_of().has_pilots
+    assert spec_of(reference_mse=0).directory("x") == spec_of(reference_mse=0.0).directory("x")
+
+
+# ---- interruption ---------------------------------------------------------------------------------------
 
 LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points": 16, "photons": 16,
         "input_spp": 1, "reference_spp": 1, "shard_size": 64}  # fmt: skip

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from itertools import combinations
 from pathlib import Path
 
 import lightning as L
@@ -18,12 +20,13 @@ from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.baselines.feature_projection import FeatureProjection
+from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.cli import main
 from nlt.errors import UserError
 from nlt.evaluation.comparison import untrained
 from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
-from nlt.models.module import RenderingModule
+from nlt.models.module import GBUFFER, RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.plain import plain
@@ -428,13 +431,14 @@ def test_untrained(name):
     expected = method(declared)
     assert expected.shape == (2, 3, 16, 16) and expected.isfinite().all() and expected.is_contiguous()
     assert method.stages == (("gbuffer",) if "oidn" in name else ()) + ("path_tracing",)
-    assert method.spp == int(name.rpartition("_")[2]) and method.pixel_fraction == 1
+    assert method.spp == int(re.findall(r"\d+", name)[0]) and method.pixel_fraction == 1
     assert not list(method.parameters())
     scaled = {**declared, "traced": batch["traced"] / 2, "exposure": batch["exposure"] * 2}
     torch.testing.assert_close(method(scaled), expected / 2, rtol=1e-4, atol=1e-5)
 
 
-def test_oidn_removes_noise_and_keeps_edges_of_its_guides():
+@pytest.mark.parametrize("name", ["oidn_1", "oidn_1_balanced", "oidn_1_fast"])
+def test_oidn_removes_noise_and_keeps_edges_of_its_guides(name):
     """A checkerboard albedo under constant light, with noise: nearer to the truth than a twentieth of the noise."""
     generator = torch.Generator().manual_seed(0)
     albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2)).expand(1, 3, 64, 64)
@@ -443,8 +447,18 @@ def test_oidn_removes_noise_and_keeps_edges_of_its_guides():
         "traced": albedo * noise, "albedo": albedo, "exposure": torch.tensor([0.5]),
         "normal": torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 64, 64),
     }  # fmt: skip
-    error = (untrained("oidn_1")(batch) - albedo).square().mean()
+    error = (untrained(name)(batch) - albedo).square().mean()
     assert error < (batch["traced"] - albedo).square().mean() / 20
+
+
+def test_oidns_quality():
+    """Three filters that make three different images; any other name is refused."""
+    batch = {**synthetic_batch(), "traced": 3 * torch.rand(2, 3, 16, 16)}
+    images = [OpenImageDenoise(quality=quality)(batch) for quality in ("fast", "balanced", "high")]
+    assert min((a - b).abs().max() for a, b in combinations(images, 2)) > 0.01
+    assert torch.equal(untrained("oidn_1")(batch), images[-1])
+    with pytest.raises(UserError, match=r"^model\.init_args\.quality: must be one of fast, balanced, high, is 'best'$"):
+        OpenImageDenoise(quality="best")
 
 
 # --- the sparse denoiser ---
@@ -503,8 +517,17 @@ def test_pixels_not_traced_have_no_influence():
     assert not torch.equal(method(batch), expected)
 
 
-def test_gbuffer_switch():
-    method = SparseDenoising(gbuffer=False, width=4)
+@pytest.mark.parametrize("one_in", [1, 4, 16, 32, 64])
+def test_guides_of_denoising(one_in):
+    """The paper's denoisers see noisy pixels and which they are; the guided ones see the G-buffer, too."""
+    plain, guided = (build(find_config("model", f"{name}_1_{one_in}")) for name in ("denoising", "guided"))
+    assert plain.inputs == ("noisy_input",) and plain.stages == ("path_tracing",)
+    assert guided.inputs == (*GBUFFER, "noisy_input") and guided.stages == ("gbuffer", "path_tracing")
+    assert plain.pixel_fraction == guided.pixel_fraction == 1 / one_in
+
+
+def test_denoising_sees_noisy_pixels_alone():
+    method = SparseDenoising(width=4)
     assert method.inputs == ("noisy_input",) and method.stages == ("path_tracing",)
     batch = synthetic_batch()
     names = ("noisy_input", "exposure", "scene", "index")

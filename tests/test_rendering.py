@@ -496,7 +496,9 @@ def test_lemma(renderer, demo):
     """Eq. 3: noisy targets give the gradient of the noise-free image in expectation; clamped ones do not."""
     renderer.scene.set_state(away("moving_lights", demo))
     camera = sample_view(demo, 16, np.random.default_rng(9))
-    inputs = torch.from_numpy(np.concatenate(list(renderer.gbuffer(camera).values()))[None].astype(float))
+    buffer = renderer.gbuffer(camera)
+    surfaces = [buffer[name] for name in ("depth", "normal", "albedo")]
+    inputs = torch.from_numpy(np.concatenate(surfaces)[None].astype(float))
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, 3, 1)).double()
     images = lambda spp, seeds: torch.from_numpy(

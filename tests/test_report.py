@@ -23,7 +23,7 @@ from nlt.evaluation.drawing.gallery import Shown, draw_failures
 from nlt.evaluation.drawing.packing import COARSEST, max_error, pack, pack_to_fit
 from nlt.evaluation.drawing.tables import write_tables
 from nlt.evaluation.paper import label, published
-from nlt.evaluation.results import load, write_rows
+from nlt.evaluation.results import load, write_manifest, write_rows
 from nlt.metrics.display import display
 from nlt.metrics.quantities import QUANTITIES
 
@@ -80,7 +80,8 @@ def markdown_tables(text):
 
 def latex_tables(text):
     """The same of LaTeX, its escapes undone."""
-    for command, character in ((r"$\pm$", "±"), (r"$\downarrow$", "↓"), (r"$\uparrow$", "↑"), ("--", "–")):
+    for command, character in ((r"$\pm$", "±"), (r"$\downarrow$", "↓"), (r"$\uparrow$", "↑"), (r"$\approx$", "≈"),
+                               ("--", "–")):  # fmt: skip
         text = text.replace(command, character)
     found = []
     for block in re.findall(r"\\toprule\n(.*?)\\bottomrule", text, re.S):
@@ -117,6 +118,44 @@ def test_all_formats_carry_the_same_numbers(stored):
                 assert theirs == ("" if key not in (known := published("table2", row["method"])) or table is not
                                   markdown[0] else f"{known[key]:g}")  # fmt: skip
     assert compared > 150
+
+
+def test_what_the_reference_cannot_tell_apart(tmp_path):
+    """Marked in every format: what is closer to the best value than the floor is to a perfect picture's."""
+    rows = {
+        "nlt": {"mse": 0.010, "mssim": 0.80, "psnr": 20.0, "fid": 50.0},
+        "cnn": {"mse": 0.012, "mssim": 0.85, "psnr": 20.1, "fid": 90.0},
+        "nlt_photons": {"mse": 0.014, "mssim": 0.76, "psnr": 20.2, "fid": 59.0},
+    }
+    results = make_results(tmp_path, rows, None)
+    before = write_and_read(results)
+    floor = {"mse": 0.003, "mssim": 0.92, "psnr": 25.2, "fid": 10.0}
+    write_manifest(tmp_path, {**results.manifest, "floor": floor})
+    markdown, latex, page = write_and_read(load(tmp_path))
+    assert page == markdown == latex
+    first, more = markdown[:2]
+    assert [line[2:5] for line in first[1:]] == [
+        ["0.01000", "0.8000 ≈", "50.00"],
+        ["0.01200 ≈", "0.8500", "90.00"],
+        ["0.01400", "0.7600", "59.00 ≈"],
+        ["0.00300", "0.9200", "10.00"],
+    ]
+    assert [line[2] for line in more[1:]] == ["20.00", "20.10", "20.20", "25.20"], "a perfect PSNR is infinite"
+    assert first[-1][:2] == [*more[-1][:1], "–"] and first[-1][0] == "reference (its halves)"
+    assert all(table[-1][0] != first[-1][0] for table in markdown[2:])
+    for old, new in zip(before[0], markdown, strict=True):  # results without a floor are drawn as ever
+        assert old == [[cell.removesuffix(" ≈") for cell in line] for line in new if line[0] != first[-1][0]]
+    assert "a quarter of this MSE" in (tmp_path / "table.md").read_text()
+
+
+def write_and_read(results):
+    """The tables of table.md, table.tex and report.html."""
+    write_tables(results)
+    report_page.write_page(results, [])
+    texts = [(results.directory / name).read_text() for name in ("table.md", "table.tex", "report.html")]
+    page = Tables(texts[2]).tables
+    markdown = markdown_tables(texts[0])
+    return markdown, latex_tables(texts[1]), [page[f"table-{k}"] for k in range(len(markdown))]
 
 
 def test_times_by_device(stored):

@@ -109,16 +109,16 @@ class LightTransportDataModule(L.LightningDataModule):
         """The dataset of a split, with the fields that the trainer's method needs; all without a trainer."""
         assert self.directory is not None, "call setup first"
         module = getattr(self.trainer, "lightning_module", None)
-        inputs = getattr(module, "inputs", None)
+        fields = getattr(module, "fields", None)
         if self.online and name == "train":
             from nlt.data.online import OnlineDataset  # which needs Mitsuba
 
             devices = self.trainer.num_devices if self.trainer else 1
             threads = max(1, cores() // (self.workers * devices))
-            return OnlineDataset(self.directory, self.stored, inputs, self.num_scenes * self.spec.train, threads)
+            return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads)
         few = name == "train" and self.train_images
         spec = dataclasses.replace(self.stored, train=few) if few else self.stored
-        return LightTransportDataset(self.directory, spec, name, inputs)
+        return LightTransportDataset(self.directory, spec, name, fields)
 
     def _loader(self, name: str) -> DataLoader:
         dataset, training = self.split(name), name == "train"

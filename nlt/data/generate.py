@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from nlt.data.engines import Died, Engine, Local, Process, find_engine
-from nlt.data.files import AnyPath, open_path, remove_leftovers
+from nlt.data.files import AnyPath, open_path, remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.sample import SPLITS
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.data.store import MANIFEST, missing_files, points_name, write_manifest, write_shard
+from nlt.data.store import (
+    MANIFEST,
+    missing_files,
+    pilot_name,
+    points_name,
+    references,
+    write_manifest,
+    write_shard,
+)
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 
 # Mitsuba's memory grows with every scene and state: a process renders so many samples and ends.
 SAMPLES_PER_JOB = 1024
+# Pilot views choose the samples per pixel of a scene's references: their number, and the samples per pixel of a half.
+PILOT_VIEWS, PILOT_SPP = 4, 32
 
 
 @dataclass(frozen=True)
@@ -66,6 +79,7 @@ def generate(
     variant = choose_variant()
     write_manifest(directory, spec, f"{variant.name}: {variant.reason}")
     print(f"rendering with {variant.name}: {variant.reason}", flush=True)
+    _choose_reference_spp(spec, directory, missing)
     _announce(spec, directory, _shards(spec, missing), engine)
     _run(spec, directory, engine, partial(_render, spec, str(directory), variant.name))
     return directory
@@ -74,6 +88,62 @@ def generate(
 def _shards(spec: DatasetSpec, missing: Iterable[str]) -> list[Shard]:
     names = set(missing)
     return [shard for shard in spec.shards() if shard.name in names]
+
+
+def _choose_reference_spp(spec: DatasetSpec, directory: AnyPath, missing: Iterable[str]) -> None:
+    """Choose the samples per pixel of each scene's references and write them down.
+
+    This is done here, once and before any shard: samples of one scene, whose workers may run on different machines,
+    must all have the same number, and it must stay the same when a killed generation is resumed.
+    """
+    for scene, description in enumerate(spec.descriptions):
+        if pilot_name(scene) not in missing:
+            continue
+        try:
+            mse = Process(_pilot, spec, scene).result()
+        except Died as error:
+            raise UserError(f"{description.file}: the renderer died on a pilot view ({error})") from None
+        pilot = min(PILOT_SPP, spec.reference_spp)
+        spp = needed_spp(spec, mse)
+        found = {"spp": spp, "predicted_mse": mse * pilot / spp, "pilot_spp": pilot, "pilot_mse": mse}
+        write_bytes(directory / pilot_name(scene), json.dumps(found, indent=1).encode())
+        most = ", the most that is allowed" if found["predicted_mse"] > spec.reference_mse else ""
+        print(f"{description.name}: references of 2 x {spp} spp{most}; predicted MSE {found['predicted_mse']:.1e}")
+
+
+def needed_spp(spec: DatasetSpec, mse: float) -> int:
+    """The samples per pixel at which halves whose MSE is `mse` on the pilot views reach `reference_mse`.
+
+    The MSE falls with the inverse of the samples per pixel. They are rounded up to a power of two.
+    """
+    pilot = min(PILOT_SPP, spec.reference_spp)
+    needed = max(pilot, pilot * mse / spec.reference_mse)
+    return min(spec.reference_spp, 2 ** math.ceil(math.log2(needed)))
+
+
+def _pilot(spec: DatasetSpec, scene: int) -> float:
+    """The MSE between two halves of a reference, as displayed: the mean over the pilot views of a scene."""
+    import torch  # not at the top, because processes that render samples do not need it
+
+    from nlt.metrics.display import display
+
+    render = SampleRenderer(spec, scene)
+    spp = min(PILOT_SPP, spec.reference_spp)
+    evaluated = [(split, index) for split in ("test", "val") for index in range(spec.count(split))]
+    errors = []
+    for k, (split, index) in enumerate(evaluated[:PILOT_VIEWS]):
+        camera = render.place(split, index)
+        # No split has this number, so no sample has these seeds: the choice must not depend on the references' noise.
+        seeds = np.random.SeedSequence([spec.seed, len(SPLITS), scene, k]).generate_state(2)
+        halves = torch.from_numpy(np.stack([render.radiance(camera, spp, int(seed)) for seed in seeds])).double()
+        a, b = display(halves, render.description.exposure)
+        errors.append(float((a - b).square().mean()))
+    return float(np.mean(errors))
+
+
+def _with_reference_spp(spec: DatasetSpec, spp: int) -> DatasetSpec:
+    """The spec with a fixed number of samples per pixel for its references, as `SampleRenderer` reads it."""
+    return replace(spec, reference_spp=spp, reference_mse=0.0)
 
 
 def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine) -> None:
@@ -89,7 +159,8 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
         cost += f" of {free / 1e9:.0f} GB free"
     if isinstance(engine, Local):  # other machines may be faster or slower than this one
         try:
-            train, evaluated = Process(_measure, spec).result()
+            mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))
+            train, evaluated = Process(_measure, _with_reference_spp(spec, mean)).result()
         except Died as error:
             raise UserError(f"the renderer died while it was tried out ({error})") from None
         seconds = (samples["train"] * train + (samples["val"] + samples["test"]) * evaluated) / engine.workers
@@ -132,7 +203,9 @@ def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) 
 def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int, tick: Callable[[int], None]) -> None:
     """A job, in a process of its own."""
     os.environ["NLT_VARIANT"] = variant  # the same on every machine
-    fill(SampleRenderer(spec, job.scene, threads), open_path(place), job, tick)
+    directory = open_path(place)
+    chosen = _with_reference_spp(spec, references(directory, spec)[job.scene]["spp"])
+    fill(SampleRenderer(chosen, job.scene, threads), directory, job, tick)
 
 
 def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:

@@ -100,7 +100,7 @@ class SampleRenderer:
             "reference_b": (spec.reference_spp, half_b),
         }
         sample |= {name: self.radiance(camera, *image) for name, image in images.items() if name in fields}
-        if not fields.keys().isdisjoint(("depth", "normal", "albedo")):
+        if not fields.keys().isdisjoint(("depth", "normal", "albedo", "emission")):
             sample |= self.renderer.gbuffer(camera)
         if any(name.startswith("photon_") for name in fields):
             sample |= self.renderer.photons(spec.photons, photons)

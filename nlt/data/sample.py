@@ -50,11 +50,14 @@ FIELDS: dict[str, Field] = {
     "noisy_input": Field(
         (3, "H", "W"), "float32", _RADIANCE, "path-traced radiance at 4 spp, other seeds: the denoisers' input"
     ),
-    "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference, 64 spp", True),
-    "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second, independent half, 64 spp", True),
+    "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference", True),
+    "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second, independent half", True),
     "depth": Field((1, "H", "W"), "float32", "m", "camera-space depth z at the pixel centre, 0 where no hit"),
     "normal": Field((3, "H", "W"), "float16", "1", "shading normal, world, 0 where no hit"),
     "albedo": Field((3, "H", "W"), "float16", "1", "diffuse reflectance in [0, 1]; 0 for mirrors and glass"),
+    "emission": Field(
+        (3, "H", "W"), "float32", _RADIANCE, "radiance seen directly from lamps and the environment, the pixel's mean"
+    ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, rigid"),
     "photon_origin": Field(("P", 3), "float32", "m", "where the photon left its emitter"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from nlt.errors import UserError
 from nlt.scenes.description import EXPERIMENTS, TEACHERS, Experiment, SceneDescription, Teacher, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 2  # of the files on disk
+FORMAT = 3  # of the files on disk
 # Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
 SECTIONS = ("data", "model", "trainer", "seed_everything")
 DATA = ("dataset", "root", "batch_size", "workers", "seed", "online", "train_images")
@@ -42,7 +43,9 @@ class DatasetSpec:
         photons: photons per sample.
         noisy_spp: samples per pixel of the training target.
         input_spp: samples per pixel of the denoisers' input.
-        reference_spp: samples per pixel of each of the reference's two halves.
+        reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the most.
+        reference_mse: how large the MSE between the two halves may be, as displayed (sRGB at the scene's exposure).
+            A few pilot views of each scene choose the samples per pixel that reach it. With 0, it is `reference_spp`.
         seed: of everything random in it.
         shard_size: samples per file.
         teacher: the integrator of noisy, noisy_input and reference; "scene": the one that scene.yaml names.
@@ -59,6 +62,7 @@ class DatasetSpec:
     noisy_spp: int = 1
     input_spp: int = 4
     reference_spp: int = 64
+    reference_mse: float = 0.0
     seed: int = 0
     shard_size: int = 64
     teacher: Literal["scene", Teacher] = "scene"
@@ -72,10 +76,16 @@ class DatasetSpec:
         if self.teacher not in ("scene", *TEACHERS):
             raise UserError(f"{at}.teacher: must be one of scene, {', '.join(TEACHERS)}, is {self.teacher!r}")
         least = {"resolution": 8, "seed": 0, **dict.fromkeys(SPLITS, 0)}
-        for field in dataclasses.fields(self)[2:-1]:
+        for field in dataclasses.fields(self):
+            if field.type != "int":
+                continue
             value, low = getattr(self, field.name), least.get(field.name, 1)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise UserError(f"{at}.{field.name}: must be a whole number of at least {low}, is {value!r}")
+        mse = self.reference_mse
+        if isinstance(mse, bool) or not isinstance(mse, int | float) or not 0 <= mse < math.inf:
+            raise UserError(f"{at}.reference_mse: must be a number of at least 0, written as 1.0e-4, is {mse!r}")
+        self.reference_mse = float(mse)  # 0 and 0.0 name the same directory
 
     @cached_property
     def descriptions(self) -> list[SceneDescription]:
@@ -100,6 +110,11 @@ class DatasetSpec:
         """Bytes on disk of one sample."""
         sizes = self.sizes
         return sum(field.nbytes(sizes) for field in self.fields(split).values())
+
+    @property
+    def has_pilots(self) -> bool:
+        """Whether pilot views choose how many samples per pixel the references have."""
+        return self.reference_mse > 0 and self.val + self.test > 0
 
     @property
     def manifest(self) -> dict[str, Any]:

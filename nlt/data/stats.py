@@ -17,7 +17,7 @@ from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, read_configs
-from nlt.data.store import read_spec, write_shard
+from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
 from nlt.paths import CONFIGS
 
@@ -39,17 +39,20 @@ def stats(place: str, workers: int | None = None) -> str:
     """A report: bytes by field of a dataset, seconds by field at its size and at the paper's, the paper's cost.
 
     Bytes follow from the manifest. Seconds are measured now, in `workers` processes side by side, warm, the mean over
-    all scenes; a reference of more than 8 spp is measured at 8 and extrapolated in proportion.
+    all scenes; a reference of more than 8 spp is measured at 8 and extrapolated in proportion. The dataset's references
+    count with the samples per pixel that its pilot views chose, those at the paper's size with the most allowed.
 
     Raises:
         UserError: there is no dataset, or the renderer dies.
     """
     spec = read_spec(open_path(place))
+    spp = [reference["spp"] for reference in references(open_path(place), spec)]
     full = read_configs([str(CONFIGS / "scale" / "paper.yaml")])["data"]["dataset"]
     paper = DatasetSpec(spec.scenes, spec.experiment, **full)
     workers = workers or cores()
     with tqdm(desc="measuring", total=2 * len(spec.scenes), unit="scene") as bar:
-        ours, theirs = (_measure(each, workers, bar) for each in (spec, paper))
+        ours = _measure(spec, spp, workers, bar)
+        theirs = _measure(paper, [paper.reference_spp] * len(spp), workers, bar)
     lines = [f"{'field':18}{'bytes':>10}{'at paper size':>15}{'ms':>10}{'at paper size':>15}"]
     for stage, fields in STAGES.items():
         timed = f"{1e3 * ours[stage]:>10.1f}{1e3 * theirs[stage]:>15.1f}"
@@ -84,11 +87,14 @@ def _cost(name: str, spec: DatasetSpec, seconds: dict[str, float], workers: int)
     )
 
 
-def _measure(spec: DatasetSpec, workers: int, bar: tqdm) -> dict[str, float]:
-    """Mean seconds per sample by stage, and `start`: what a process costs besides its samples."""
-    few = replace(spec, train=_WARM_UP + _SAMPLES, val=0, test=0)
+def _measure(spec: DatasetSpec, spp: list[int], workers: int, bar: tqdm) -> dict[str, float]:
+    """Mean seconds per sample by stage, and `start`: what a process costs besides its samples.
+
+    `spp`: the samples per pixel of each half of a scene's references, by scene.
+    """
     results = []
     for scene in range(len(spec.scenes)):
+        few = replace(spec, train=_WARM_UP + _SAMPLES, val=0, test=0, reference_spp=spp[scene])
         try:
             runs = [Process(_time, few, scene, max(1, cores() // workers), time.time()) for _ in range(workers)]
             results += [run.result() for run in runs]

@@ -110,14 +110,43 @@ def points_name(scene: int) -> str:
     return f"points-{scene:03d}.safetensors"
 
 
+def pilot_name(scene: int) -> str:
+    """The file with what the pilot views of a scene chose, relative to the dataset's directory."""
+    return f"pilot-{scene:03d}.json"
+
+
+def read_pilot(directory: AnyPath, scene: int) -> dict[str, Any]:
+    """What the pilot views of a scene chose: `spp`, and the MSE between the reference's halves that it predicts.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    path = directory / pilot_name(scene)
+    try:
+        found = json.loads(path.read_text())
+        return {"spp": int(found["spp"]), "predicted_mse": float(found["predicted_mse"])}
+    except FileNotFoundError:
+        raise UserError(f"{path}: missing; run `nlt generate` again") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: damaged ({error}); delete the file and run `nlt generate` again") from None
+
+
+def references(directory: AnyPath, spec: DatasetSpec) -> list[dict[str, Any]]:
+    """By scene `spp`, the samples per pixel of each half of a reference; with pilot views also what they predict."""
+    scenes = range(len(spec.scenes))
+    return [read_pilot(directory, k) if spec.has_pilots else {"spp": spec.reference_spp} for k in scenes]
+
+
 def write_manifest(directory: AnyPath, spec: DatasetSpec, variant: str) -> None:
     """Record what the dataset is made of and what rendered it; the same two write the same bytes."""
     write_bytes(directory / MANIFEST, json.dumps(spec.manifest | {"variant": variant}, indent=1).encode())
 
 
 def dataset_files(spec: DatasetSpec) -> list[str]:
-    """Point clouds and shards of a dataset, relative to its directory."""
-    return [points_name(k) for k in range(len(spec.scenes))] + [shard.name for shard in spec.shards()]
+    """Pilots' choices, point clouds and shards of a dataset, relative to its directory."""
+    scenes = range(len(spec.scenes))
+    pilots = [pilot_name(k) for k in scenes] if spec.has_pilots else []
+    return pilots + [points_name(k) for k in scenes] + [shard.name for shard in spec.shards()]
 
 
 def missing_files(directory: AnyPath, spec: DatasetSpec) -> list[str]:

@@ -18,7 +18,7 @@ from nlt.data.engines import cores
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.sample import POINT_FIELDS, SPLITS, Field
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.data.store import CRC, MANIFEST, dataset_files, points_name, read_manifest, read_spec
+from nlt.data.store import CRC, MANIFEST, dataset_files, pilot_name, points_name, read_manifest, read_pilot, read_spec
 from nlt.errors import UserError
 from nlt.scenes.state import SceneState
 
@@ -39,6 +39,7 @@ def verify(place: str) -> None:
     findings = _check_manifest(directory, spec)
     findings += [f"{name}: missing" for name in wanted if name not in there]
     findings += [f"{name}: not part of the dataset" for name in sorted(there - {MANIFEST, *wanted})]
+    findings += _check_pilots(directory, spec, there)
     tasks: list[Shard | int] = [k for k in range(len(spec.scenes)) if points_name(k) in there]
     tasks += [shard for shard in spec.shards() if shard.name in there]
     states: dict[tuple[int, str], set[bytes]] = {}
@@ -62,6 +63,15 @@ def _check_manifest(directory: AnyPath, spec: DatasetSpec) -> list[str]:
         for key in ("format", "scenes", "exposure", "shards")
         if manifest.get(key) != now[key]
     ]
+
+
+def _check_pilots(directory: AnyPath, spec: DatasetSpec, there: set[str]) -> Iterable[str]:
+    for scene in range(len(spec.scenes)):
+        if spec.has_pilots and pilot_name(scene) in there:
+            try:
+                read_pilot(directory, scene)
+            except UserError as error:
+                yield str(error)
 
 
 @dataclass

@@ -21,12 +21,15 @@ from nlt.metrics.quantities import QUANTITIES
 
 Verdict = Literal["holds", "does not hold", "undecided", "not measured"]
 
+BELOW_FLOOR = "the difference is smaller than the reference's own error"
+
 
 @dataclass(frozen=True)
 class Comparison:
     """One inequality of a claim: `margin` is positive where it is as claimed, in the metric's unit.
 
     `low` and `high`: 95% interval of the margin over test images and, where there are several, over seeds.
+    `below_floor`: the two methods differ by less than the two halves of the reference do.
     """
 
     metric: str
@@ -36,6 +39,7 @@ class Comparison:
     low: float
     high: float
     verdict: Verdict
+    below_floor: bool
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,8 @@ def _compare(results: Results, metric: str, method: str, other: str, by: float, 
         verdict: Verdict = "not measured"
     else:
         verdict = "holds" if low > 0 else "does not hold" if high < 0 else "undecided"
-    return Comparison(metric, method, other, margin, low, high, verdict)
+    below = results.is_below_floor(metric, results.mean(method, metric) - results.mean(other, metric))
+    return Comparison(metric, method, other, margin, low, high, verdict, below)
 
 
 def difference(results: Results, metric: str, a: str, b: str, factor: float = 1.0) -> tuple[float, float]:
@@ -146,7 +151,10 @@ def text(claim: Claim) -> str:
     """The comparison that decides a claim, in words and numbers."""
     c = claim.weakest
     name = f"{QUANTITIES[c.metric].label}, {label(c.method)} against {label(c.other)}"
-    return name if not math.isfinite(c.margin) else f"{name}: {c.margin:+.3g} [{c.low:+.3g}, {c.high:+.3g}]"
+    if not math.isfinite(c.margin):
+        return name
+    below = f"; {BELOW_FLOOR}" if c.below_floor else ""
+    return f"{name}: {c.margin:+.3g} [{c.low:+.3g}, {c.high:+.3g}]{below}"
 
 
 def write_claims(results: Results) -> list[Claim]:

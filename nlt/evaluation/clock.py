@@ -88,7 +88,7 @@ class Clock:
                 spp = method.spp or spec.input_spp
                 work = partial(renderer.radiance, camera, spp, index, pixels)
                 traced.append(self._lap(seconds, "path_tracing", work))
-        if "traced" in method.inputs:
+        if "traced" in method.fields:
             batch["traced"] = torch.from_numpy(np.stack(traced)).to(self.device)
         result: Any = None
         for name, step in method.steps().items():
@@ -148,7 +148,7 @@ class Clock:
     def _inputs(self, method: Method) -> Batch:
         """A batch with what the method reads and no more."""
         whole = self._batch([k % len(self.dataset) for k in range(self.batch)])
-        batch = {name: value for name, value in whole.items() if name in (*method.inputs, "exposure", "scene")}
+        batch = {name: value for name, value in whole.items() if name in (*method.fields, "exposure", "scene")}
         return method.thin(batch | {"index": torch.zeros_like(batch["scene"])})
 
 

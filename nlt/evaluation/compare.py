@@ -14,11 +14,12 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Died
 from nlt.data.generate import generate
 from nlt.data.spec import load_spec, read_configs
+from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.clock import Clock
 from nlt.evaluation.comparison import Comparison, untrained
 from nlt.evaluation.drawing.report import draw
-from nlt.evaluation.drawing.tables import live_header, live_row, write_tables
+from nlt.evaluation.drawing.tables import live_floor, live_header, live_row, write_tables
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin, surroundings
@@ -90,6 +91,7 @@ def compare(
         **surroundings(device, policy),
         **_subject(comparison, test),
         "train_images": sorted(train_images),
+        **_floor(test),
     }
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
@@ -118,7 +120,7 @@ def compare(
         write_rows(directory / VIEWS, views)
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         write_tables(load(directory))
-    print("\n" + "\n".join([live_header(), *(live_row(run) for run in runs)]))
+    print("\n" + "\n".join([live_header(), *(live_row(run) for run in runs), live_floor(record["floor"])]))
     # What the table's own trainings saw is a point of the curve, too.
     images = [{**run, "train_images": spec.train} for run in runs if train_images and not untrained(run["method"])]
     rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in images]
@@ -144,6 +146,13 @@ def _subject(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
         "shown": test.shown,
         "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
     }
+
+
+def _floor(test: Evaluation) -> dict[str, Any]:
+    """How good the references are, for the manifest."""
+    floor, measured = test.floor()
+    known = zip(measured.items(), references(test.directory, test.spec), strict=True)
+    return {"floor": floor, "references": {scene: {**found, "measured_mse": mse} for (scene, mse), found in known}}
 
 
 def _on_fewer(

@@ -13,19 +13,21 @@ from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
 
-_KEYS = ("table", "data", "scale", "methods", "seed")
+_KEYS = ("table", "data", "scale", "variant", "methods", "seed")
 
 
 @dataclass
 class Comparison:
-    """What a config of configs/compare asks for; METHOD@VARIANT is a method with what configs/variant changes.
+    """What a config of configs/compare asks for.
 
-    Its name says if it is at another scale or of other data.
+    `variant` is a config of configs/variant that changes every trained method; METHOD@VARIANT changes one of them,
+    after that. The name says whether the scale or the data are other than the config's.
     """
 
     name: str
     data: Path
     scale: Path
+    variant: Path | None = None
     table: str | None = None
     methods: list[str] = field(default_factory=list)
     seeds: list[int] = field(default_factory=lambda: [0])
@@ -61,12 +63,15 @@ class Comparison:
             raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise UserError(f"{file}: seed: must be a whole number of at least 0, is {seed!r}")
+        variants = config_names("variant")
+        every = content.get("variant")
+        if every is not None and every not in variants:
+            raise UserError(f"{file}: variant: none is named {every!r}; known are {', '.join(variants)}")
         known = sorted(config_names("model"), key=order)
         # Those in folders belong to a comparison that names them.
         wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
         for method in wanted:
             name, _, variant = method.partition("@")
-            variants = config_names("variant")
             if name not in known:
                 raise UserError(f"{file}: methods: no method {name!r} in configs/model; known are {', '.join(known)}")
             if "@" in method and variant not in variants:
@@ -77,6 +82,7 @@ class Comparison:
             name="-".join(names),
             data=find_config("data", content["data"]),
             scale=find_config("scale", content["scale"]),
+            variant=find_config("variant", every) if every else None,
             table=table,
             methods=sorted(wanted, key=order),
             seeds=list(range(seed, seed + seeds)),
@@ -90,8 +96,8 @@ class Comparison:
     def configs(self, method: str) -> list[str]:
         """The config files of a method's training, in order."""
         name, _, variant = method.partition("@")
-        variants = [find_config("variant", variant)] if variant else []
-        return [str(path) for path in (self.data, find_config("model", name), self.scale, *variants)]
+        variants = [self.variant, find_config("variant", variant) if variant else None]
+        return [str(path) for path in (self.data, find_config("model", name), self.scale, *filter(None, variants))]
 
 
 def untrained(method: str) -> Method | None:

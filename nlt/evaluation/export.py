@@ -50,7 +50,7 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
         return
     method = load_method(checkpoint, "CKPT")
     sizes: dict[str, int] = {"H": resolution, "W": resolution, "P": photons, "N": method.hparams["num_points"]}
-    fields = {name: (FIELDS | BATCH_FIELDS)[name] for name in (*method.inputs, "exposure", "scene", "index")}
+    fields = {name: (FIELDS | BATCH_FIELDS)[name] for name in (*method.fields, "exposure", "scene", "index")}
     batch, described = {}, {}
     for name, field in fields.items():
         dtype = "float32" if field.dtype == "float16" else field.dtype

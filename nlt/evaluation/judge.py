@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from nlt.evaluation.frames import Frames
 from nlt.evaluation.results import write_images
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.jackknife import fid_and_kid_without
+from nlt.metrics.quantities import OF_HALVES
 from nlt.models.method import Batch, Method
 from nlt.models.module import PROJECTION
 from nlt.models.policy import Policy
@@ -66,6 +68,23 @@ class Evaluation:
         return (pixels < batch["depth"][0].numel()).any(1).numpy()
 
     @torch.inference_mode()
+    def floor(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The metrics of the reference's half A, judged as a prediction against half B; the MSE of each scene.
+
+        The metrics that need two independent halves of a reference are left out, and so are those that are not finite.
+        """
+        metrics = ImageMetrics(perceptual=True).to(self.device)
+        dataset = LightTransportDataset(self.directory, self.spec, "test", ())
+        mse: list[float] = []
+        for batch in DataLoader(dataset, batch_size=_BATCH, collate_fn=collated):
+            a, b, exposure = (batch[name].to(self.device) for name in ("reference_a", "reference_b", "exposure"))
+            mse += metrics.update(a, b, b, exposure)["mse"].tolist()
+        values = {name: float(value) for name, value in metrics.compute().items() if name not in OF_HALVES}
+        by_scene = np.reshape(mse, (-1, self.spec.test)).mean(1).tolist()
+        names = [description.name for description in self.spec.descriptions]
+        return {k: v for k, v in values.items() if math.isfinite(v)}, dict(zip(names, by_scene, strict=True))
+
+    @torch.inference_mode()
     def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
         """All metrics of a method; those of each view; its radiance (V, 3, H, W) of the views that are shown.
 
@@ -74,12 +93,12 @@ class Evaluation:
         """
         method = method.to(self.device).eval()
         metrics = ImageMetrics(perceptual=True).to(self.device)
-        dataset = LightTransportDataset(self.directory, self.spec, "test", method.inputs)
+        dataset = LightTransportDataset(self.directory, self.spec, "test", method.fields)
         shown, rows = [], []
         pools: list[tuple[Tensor, Tensor]] = []
         for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH, collate_fn=collated)):
             indices = cpu_batch["index"].tolist()
-            if "traced" in method.inputs and method.spp:
+            if "traced" in method.fields and method.spp:
                 cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
             with self.policy.applied(self.device):  # the images that are timed

@@ -65,11 +65,11 @@ class ModelRenderer:
         self._seeds = np.random.SeedSequence([_MODEL])
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
-        self._of_state = {name for name in method.inputs if name.startswith("photon_")}
-        self.points: Points = self._cloud() if any(name.startswith("point_") for name in method.inputs) else {}
+        self._of_state = {name for name in method.fields if name.startswith("photon_")}
+        self.points: Points = self._cloud() if any(name.startswith("point_") for name in method.fields) else {}
         if self.points:
             self._of_state |= {"translation", "present"}
-        wanted = {*method.inputs} - {"view_direction"}  # added here, of any size
+        wanted = {*method.fields} - {"view_direction"}  # added here, of any size
         self._tensors = SampleTensors(spec, {scene: self.points} if self.points else {}, wanted)
 
     def _cloud(self) -> Points:
@@ -79,7 +79,7 @@ class ModelRenderer:
 
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """What the method reads of a frame, as a batch of one."""
-        images = {name for name in self.method.inputs if name in ("depth", "normal", "albedo", "noisy_input")}
+        images = {*self.method.fields} & {"depth", "normal", "albedo", "emission", "noisy_input"}
         few = self.method.pixel_fraction < 1
         images -= {"noisy_input"} if few else set()
         self._enter(state)

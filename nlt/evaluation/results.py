@@ -3,7 +3,9 @@
 results/NAME/ holds
 
 - `manifest.json`: command, commit, device, versions, configs; `methods` in the table's order, `table` (the paper's,
-  or null), `n_test`, `seeds`, `scenes`, `shown` (the indices of the test views whose images are kept);
+  or null), `n_test`, `seeds`, `scenes`, `shown` (the indices of the test views whose images are kept); `floor`, the
+  metrics of the reference's half A judged as a prediction against its half B; `references`, by scene: the samples per
+  pixel of a half (`spp`), the MSE between the halves that pilot views predicted and the one measured on the test split;
 - `runs.csv`: a row per method and seed with every number as it was measured, by the keys of `QUANTITIES`; `status`
   is ok, diverged or failed, and `message` says why; `family` is the method's class, `spp` and `pixel_fraction` what
   of a frame it path traces, `run` the directory of its training;
@@ -65,6 +67,23 @@ class Results:
     def methods(self) -> list[str]:
         """Those that were run, in the table's order; a method that diverged or failed is among them."""
         return list(dict.fromkeys(run["method"] for run in self.runs))
+
+    @property
+    def floor(self) -> Mapping[str, float]:
+        """The metrics of the reference's half A, judged as a prediction against half B; empty in older results."""
+        return self.manifest.get("floor", {})
+
+    def is_below_floor(self, key: str, difference: float) -> bool:
+        """Whether a difference in a metric is smaller than the error of one half of the reference against the other."""
+        perfect = QUANTITIES[key].perfect
+        return key in self.floor and perfect is not None and abs(difference) < abs(self.floor[key] - perfect)
+
+    def best(self, key: str) -> str | None:
+        """The method with the best mean; None where nothing was measured."""
+        means = {method: self.mean(method, key) for method in self.methods}
+        means = {method: mean for method, mean in means.items() if math.isfinite(mean)}
+        choose = min if QUANTITIES[key].direction == "lower" else max
+        return choose(means, key=means.__getitem__, default=None)
 
     def runs_of(self, method: str) -> list[dict[str, Any]]:
         """A method's runs that came to an end."""

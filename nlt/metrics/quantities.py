@@ -24,6 +24,7 @@ class Quantity:
     scale: float = 1.0  # from what is stored, an SI unit, to what is printed
     domain: str = ""  # what it is computed on
     per_image: bool = False  # the mean over images of a value that each image has
+    perfect: float | None = None  # the value of a perfect picture, where it is finite
 
 
 _DISPLAY = "sRGB in [0, 1] at the scene's exposure"
@@ -32,17 +33,23 @@ _FEATURES = "Inception features of sRGB"
 
 
 def _image(
-    label: str, direction: Literal["lower", "higher"], form: str, domain: str, unit: str = "1", per_image: bool = True
+    label: str,
+    direction: Literal["lower", "higher"],
+    form: str,
+    domain: str,
+    unit: str = "1",
+    per_image: bool = True,
+    perfect: float | None = 0.0,
 ) -> Quantity:
-    return Quantity(label, direction, form, unit, domain=domain, per_image=per_image)
+    return Quantity(label, direction, form, unit, domain=domain, per_image=per_image, perfect=perfect)
 
 
 METRICS: dict[str, Quantity] = {
     "mse": _image("MSE", "lower", ".5f", _DISPLAY),
     "unbiased_mse": _image("Unbiased MSE", "lower", ".3e", _LINEAR),
     "reference_noise": _image("Reference noise", "lower", ".3e", _LINEAR),
-    "psnr": _image("PSNR", "higher", ".2f", _DISPLAY, "dB"),
-    "mssim": _image("MSSIM", "higher", ".4f", _DISPLAY),
+    "psnr": _image("PSNR", "higher", ".2f", _DISPLAY, "dB", perfect=None),
+    "mssim": _image("MSSIM", "higher", ".4f", _DISPLAY, perfect=1.0),
     "flip": _image("FLIP", "lower", ".4f", _DISPLAY),
     "fid": _image("FID", "lower", ".2f", _FEATURES, per_image=False),
     "kid": _image("KID", "lower", ".4f", _FEATURES, per_image=False),
@@ -52,6 +59,7 @@ METRICS: dict[str, Quantity] = {
         for stage in INCEPTION_STAGES
     },
 }
+OF_HALVES = ("unbiased_mse", "reference_noise")  # are computed from two independent halves of a reference
 PERCEPTUAL = tuple(key for key, metric in METRICS.items() if metric.domain.startswith(_FEATURES))
 
 COSTS: dict[str, Quantity] = {

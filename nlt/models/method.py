@@ -19,11 +19,16 @@ class Method(nn.Module):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the batch fields `forward` reads, besides exposure, scene and index.
+        """Names of the batch fields the method's features are made of, besides exposure, scene and index.
 
         "traced" is rendered for the method: path-traced radiance (B, 3, H, W) at its `spp`.
         """
         raise NotImplementedError
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of all batch fields that `forward` reads: `inputs`, and what else its image is made of."""
+        return self.inputs
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
-from torch.optim.lr_scheduler import ExponentialLR
+from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
 
 from nlt.errors import DivergedError, UserError
 from nlt.metrics.display import expose
@@ -29,11 +30,13 @@ PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
 GBUFFER_CHANNELS = 10
 
+_WARM_UP = 0.05  # share of the steps, with the schedule "cosine"
+
 Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), which are valid (B, N)
 Features = Tensor | tuple[Tensor, list[SparseMap]]
 
 # What checkpoints have that were written before it could be chosen.
-_FIXED = {"points": True, "point_width": 64, "photon_width": 64}
+_FIXED = {"points": True, "point_width": 64, "photon_width": 64, "output": "radiance", "add_emission": True}
 
 
 def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
@@ -43,6 +46,14 @@ def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
     the rest, and fed linearly would swamp every feature it is mixed with.
     """
     return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
+
+
+def warm_up_and_cosine(step: int, steps: int) -> float:
+    """The factor to the learning rate at a step, out of `steps`: up to 1 in the first 5 %, then down to 0."""
+    warm_up = math.ceil(_WARM_UP * steps)
+    if step < warm_up:
+        return (step + 1) / warm_up
+    return (1 + math.cos(math.pi * (step - warm_up) / max(1, steps - warm_up))) / 2
 
 
 def join(maps: Sequence[Tensor]) -> Tensor:
@@ -60,7 +71,7 @@ class RenderingModule(Method, L.LightningModule):
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
-    architecture: tuple[str, ...] = ("width", "depth")
+    architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission")
 
     def __init__(
         self,
@@ -68,9 +79,15 @@ class RenderingModule(Method, L.LightningModule):
         depth: int = 3,
         point_width: int = 64,
         photon_width: int = 64,
+        output: Literal["radiance", "demodulated"] = "radiance",
+        add_emission: bool = True,
         loss: Literal["mse", "relative_mse"] = "mse",
         learning_rate: float = 5e-4,
+        lr_schedule: Literal["paper", "cosine"] = "paper",
         lr_decay: float = 0.99,
+        embedding_lr: float = 1.0,
+        embedding_decay: float = 0.0,
+        clip_share: float = 1.0,
         num_scenes: int = 1,
         num_points: int = 1,
         max_points: int | None = None,
@@ -84,9 +101,19 @@ class RenderingModule(Method, L.LightningModule):
             depth: number of times the U-Net halves the resolution.
             point_width: features of a point, even; of methods with a PointNet.
             photon_width: features of a photon; of methods with a photon network.
+            output: how the U-Net's channels become an image. "radiance" is the paper's: three channels are the image.
+                "demodulated": albedo times the first three channels, plus the last three. A method that is not given
+                the albedo predicts radiance either way.
+            add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
+                the renderer knows exactly.
             loss: a function in nlt.models.losses.
-            learning_rate: of Adam.
-            lr_decay: factor to the learning rate after each epoch.
+            learning_rate: the rate of Adam; with the schedule "cosine", its peak.
+            lr_schedule: "paper" multiplies the rate by `lr_decay` after each epoch. "cosine" changes it at every step:
+                a linear warm-up over the first 5 % of the steps, then half a cosine down to zero.
+            lr_decay: factor to the learning rate after each epoch, with the schedule "paper".
+            embedding_lr: factor to the learning rate of what is learned of each point.
+            embedding_decay: weight decay, apart from the gradient (Loshchilov and Hutter 2019), of the same.
+            clip_share: share of the steps, from the first, in which the trainer's gradient_clip_val applies.
             num_scenes: scenes in the dataset; linked from the data.
             num_points: points per scene; linked from the data.
             max_points: use so many of them; None for all.
@@ -98,6 +125,8 @@ class RenderingModule(Method, L.LightningModule):
         for name, value, least in (("width", width, 1), ("depth", depth, 0), *transport):
             if value < least:
                 raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
+        if not 0 <= clip_share <= 1:
+            raise UserError(f"model.init_args.clip_share: must be between 0 and 1, is {clip_share}")
         for name, most in (("max_points", max_points), ("max_photons", max_photons)):
             if most is not None and most < 1:
                 raise UserError(f"model.init_args.{name}: must be at least 1, is {most}")
@@ -107,7 +136,8 @@ class RenderingModule(Method, L.LightningModule):
         self.hparams["num_points"] = min(num_points, max_points or num_points)  # the embeddings that it has
         self.loss = getattr(losses, loss)
         # channels_last: the convolutions' fastest layout
-        self.unet = UNet(self.feature_channels, width, depth).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)
+        self.unet = unet.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._metrics: list[ImageMetrics] = []  # a list hides it from the parameters and the checkpoint
 
     # --- what a method is ---
@@ -116,6 +146,15 @@ class RenderingModule(Method, L.LightningModule):
     def feature_channels(self) -> int:
         """Channels of what `features` returns."""
         raise NotImplementedError
+
+    @property
+    def demodulates(self) -> bool:
+        """Whether the U-Net's output is multiplied by the albedo: see the argument `output`."""
+        return self.hparams["output"] == "demodulated" and "albedo" in self.inputs
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        return (*self.inputs, "emission") if self.demodulates and self.hparams["add_emission"] else self.inputs
 
     @property
     def state_inputs(self) -> tuple[str, ...]:
@@ -154,12 +193,23 @@ class RenderingModule(Method, L.LightningModule):
         return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds)])
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
-        """Features to linear radiance (B, 3, H, W); the U-Net itself works in exposed radiance."""
-        exposure = batch["exposure"]
+        """Features to linear radiance (B, 3, H, W)."""
         dense, sparse = (features, []) if isinstance(features, Tensor) else features
-        exposed = self.unet(dense.contiguous(memory_format=torch.channels_last), sparse)
-        # Out of what layout and, under autocast, precision the convolutions ran in.
-        return expose(exposed.contiguous().to(exposure.dtype), 1 / exposure)
+        channels = self.unet(dense.contiguous(memory_format=torch.channels_last), sparse)
+        # Out of the layout and, under autocast, the precision that the convolutions ran in.
+        return self.to_radiance(batch, channels.contiguous().to(batch["exposure"].dtype))
+
+    def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
+        """The U-Net's output (B, 3 or 6, H, W), in exposed radiance, as linear radiance (B, 3, H, W).
+
+        It is affine in the output either way, so that Lemma 1 holds: the gradient towards a noisy, unbiased target has
+        the expectation of the gradient towards the noise-free one.
+        """
+        if not self.demodulates:
+            return expose(channels, 1 / batch["exposure"])
+        scale, offset = channels.split(3, dim=1)
+        radiance = expose(batch["albedo"] * scale + offset, 1 / batch["exposure"])
+        return radiance + batch["emission"] if self.hparams["add_emission"] else radiance
 
     @property
     def embeds(self) -> bool:
@@ -202,14 +252,32 @@ class RenderingModule(Method, L.LightningModule):
         return loss
 
     def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.hparams["learning_rate"], fused=True)
-        return [optimizer], [ExponentialLR(optimizer, gamma=self.hparams["lr_decay"])]
+        chosen = self.hparams
+        rate, embeddings = chosen["learning_rate"], self._embeddings()
+        known = {id(parameter) for parameter in embeddings}
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if id(p) not in known]}]
+        if embeddings:
+            own = {"lr": rate * chosen["embedding_lr"], "weight_decay": chosen["embedding_decay"]}
+            groups.append({"params": embeddings, **own})
+        optimizer = torch.optim.Adam(groups, lr=rate, decoupled_weight_decay=True, fused=True)
+        if chosen["lr_schedule"] == "paper":
+            return [optimizer], [ExponentialLR(optimizer, gamma=chosen["lr_decay"])]
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = LambdaLR(optimizer, lambda step: warm_up_and_cosine(step, steps))
+        return [optimizer], [{"scheduler": schedule, "interval": "step"}]
+
+    def _embeddings(self) -> list[nn.Parameter]:
+        return [p for part in self.modules() if isinstance(part, PointEmbedding) for p in part.parameters()]
 
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: Any = None, gradient_clip_algorithm: Any = None
     ) -> None:
-        """As the trainer says. Lightning's own refuses a fused Adam in mixed precision, but here no loss is scaled."""
-        if gradient_clip_val:
+        """Clip as the trainer says, in the first `clip_share` of the steps.
+
+        Lightning's own method refuses a fused Adam in mixed precision, but here no loss is scaled.
+        """
+        share = self.hparams["clip_share"]
+        if gradient_clip_val and (share == 1 or self.global_step < share * self.trainer.estimated_stepping_batches):
             clip = clip_grad_value_ if gradient_clip_algorithm == "value" else clip_grad_norm_
             clip(self.parameters(), gradient_clip_val)
 

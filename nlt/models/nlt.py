@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.data.sample import MATERIALS
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, join, log_exposed
+from nlt.models.projection import average_rows, visible_pixels
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
 POINT_ATTRIBUTES = 3 + len(MATERIALS) + 3 + 3 + 1  # position, material, albedo, emission, visibility
@@ -57,9 +58,13 @@ class NeuralLightTransport(RenderingModule):
         return ("gbuffer", "photons") if self.hparams["photons"] else ("gbuffer",)
 
     def transport(self, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
-        """Features of the points (B, N, point_width) and of the photons (B, P, photon_width), None if not used."""
+        """Features of the points (B, N, point_width) and of the photons (B, P, photon_width), None if not used.
+
+        In training, `features` computes those of the photons, for it knows which of them the view sees.
+        """
         points = self._point_features(batch) if self.hparams["points"] else None
-        return points, self._photon_features(batch) if self.hparams["photons"] else None
+        now = self.hparams["photons"] and not self.training
+        return points, self.photon_network(self._photons(batch)) if now else None
 
     def _point_features(self, batch: Batch) -> Tensor:
         exposure, visible = batch["exposure"], batch["point_visible"]
@@ -73,11 +78,12 @@ class NeuralLightTransport(RenderingModule):
         ]
         return self.pointnet(torch.cat([x.to(points[0].dtype) for x in points], dim=-1), visible)
 
-    def _photon_features(self, batch: Batch) -> Tensor:
+    def _photons(self, batch: Batch) -> Tensor:
+        """The photon network's input (B, P, 9)."""
         # Times their number: a photon carries that share of the power that arrives.
         power = batch["photon_flux"] * batch["photon_valid"].sum(1).view(-1, 1, 1)
         colour = log_exposed(power, batch["exposure"])
-        return self.photon_network(torch.cat([batch["photon_origin"], batch["photon_direction"], colour], dim=-1))
+        return torch.cat([batch["photon_origin"], batch["photon_direction"], colour], dim=-1)
 
     def features(self, batch: Batch, transported: Any = None) -> Features:
         points, photons = transported
@@ -86,4 +92,15 @@ class NeuralLightTransport(RenderingModule):
             clouds.append((points, batch["point_position"], batch["point_visible"]))
         if photons is not None:
             clouds.append((photons, batch["photon_hit"], batch["photon_valid"]))
-        return self.gbuffer_and(batch, clouds)
+        maps = self.gbuffer_and(batch, clouds)
+        return join([maps, self._seen_photons(batch)]) if self.hparams["photons"] and photons is None else maps
+
+    def _seen_photons(self, batch: Batch) -> Tensor:
+        """The map (B, photon_width, H, W) of the photons, whose features are computed where the view sees them."""
+        images, _, height, width = batch["depth"].shape
+        view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
+        pixels = visible_pixels(batch["photon_hit"], batch["photon_valid"], **view)
+        seen = pixels < height * width
+        first = height * width * torch.arange(images, device=pixels.device)[:, None]
+        rows = self.photon_network(self._photons(batch)[seen])
+        return average_rows(rows, (pixels + first)[seen], images, height, width)

@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlt.metrics.display import expose
 from nlt.models.module import Batch, Features, RenderingModule
 from nlt.models.policy import Policy
 from nlt.models.unet import UNet
@@ -37,7 +36,7 @@ class _Plain(RenderingModule):
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         assert isinstance(features, Tensor)
-        return expose(_unet(self.unet, features.contiguous()), 1 / batch["exposure"])
+        return self.to_radiance(batch, _unet(self.unet, features.contiguous()))
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         return {name: _in_float32(step) for name, step in super().steps().items()}
@@ -64,7 +63,7 @@ def _float32(device: torch.device) -> Iterator[None]:
 
 
 def _unet(net: UNet, x: Tensor) -> Tensor:
-    """The supplementary's figure, block by block: (B, C, H, W) to (B, 3, H, W)."""
+    """The supplementary's figure, block by block: (B, C, H, W) to (B, 3 or 6, H, W)."""
     levels = [_block(net.down[0], net.conv_in(x))]
     for block in net.down[1:]:
         levels.append(_block(block, F.max_pool2d(levels[-1], 2, ceil_mode=True)))

@@ -108,6 +108,14 @@ def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor
     return total(features, pixels, height, width).div_(count.clamp(min=1))
 
 
+def average_rows(rows: Tensor, pixels: Tensor, batch: int, height: int, width: int) -> Tensor:
+    """Mean of rows (M, C) by pixels (M,), (image * height + row) * width + column: (batch, C, height, width)."""
+    rows = rows.to(torch.promote_types(rows.dtype, torch.float32))  # as in `total`
+    sums = rows.new_zeros(batch * height * width, rows.shape[1]).index_add_(0, pixels, rows)
+    count = torch.bincount(pixels, minlength=len(sums)).clamp(min=1)
+    return (sums / count[:, None]).view(batch, height, width, -1).permute(0, 3, 1, 2)
+
+
 def average_sparsely(features: Tensor, pixels: Tensor, height: int, width: int) -> SparseMap:
     """As `average`: a row for each pixel in which a point is visible."""
     visible = pixels < height * width

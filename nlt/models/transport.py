@@ -40,6 +40,17 @@ class ResidualBlock(nn.Module):
         return self.shortcut(x) + self.fc_1(F.relu(self.fc_0(F.relu(x))))
 
 
+def exactly(layer: nn.Linear, x: Tensor) -> Tensor:
+    """The layer's output in the precision of x; under autocast, rounded only then.
+
+    bfloat16 would round a position of 4 to 8 m to 1.6 cm before it is used.
+    """
+    device = x.device.type
+    with torch.autocast(device, enabled=False):
+        y = layer(x)
+    return y.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else y
+
+
 def masked_max(x: Tensor, mask: Tensor) -> Tensor:
     """Maximum of x (B, N, C) over the points in mask (B, N) bool: (B, C), zero where the mask is empty."""
     hide = torch.where(mask, 0.0, -torch.inf).to(x.dtype)
@@ -61,7 +72,7 @@ class PointNet(nn.Module):
         self.blocks = nn.ModuleList(ResidualBlock(features, half, half) for _ in range(depth))
 
     def forward(self, points: Tensor, visible: Tensor) -> Tensor:
-        x = self.preprocess(points)
+        x = exactly(self.preprocess, points)
         for block in self.blocks:
             local = block(x)
             x = torch.cat([local, masked_max(local, visible)[:, None].expand_as(local)], dim=-1)
@@ -71,6 +82,13 @@ class PointNet(nn.Module):
 class PhotonNetwork(nn.Sequential):
     """Sec. "Implementation Details": a fully connected ResNet, each photon for itself: (B, P, in_features) ->
     (B, P, features)."""
+
+    def forward(self, photons: Tensor) -> Tensor:
+        first, *blocks = self
+        x = exactly(first, photons)
+        for block in blocks:
+            x = block(x)
+        return x
 
     def __init__(self, in_features: int, features: int = 64, depth: int = 2) -> None:
         super().__init__(

@@ -11,11 +11,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import ndimage
 
 from nlt.errors import UserError
 from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.lanes import freeze, is_jit, launch
+from nlt.scenes.masks import first_surface, is_mask
 from nlt.scenes.pointcloud import diffuse_albedo
 
 log = logging.getLogger(__name__)
@@ -25,6 +27,7 @@ _MAX_LANES = 1 << 20
 _PILOT = 1 << 15  # photons cast per emitter to find out how many arrive
 _MOST_CASTS = 1024  # per photon that is to arrive
 _WALL = 0.005  # metres: what meets a wall's outer side does not cross the room
+_SIDE = 4  # Emission is the mean over a grid of 4 x 4 rays in each pixel.
 
 
 class Renderer:
@@ -46,8 +49,10 @@ class Renderer:
             {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
         )
         self.emitters = list(scene.mi_scene.emitters())
+        self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
         self._radiance = freeze(_radiance if self.teacher == "path" else _bidirectional)
         self._gbuffer = freeze(_gbuffer)
+        self._emission = freeze(_emission)
         self._transmits = freeze(_transmits)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
@@ -129,19 +134,54 @@ class Renderer:
         return {"scene": self.scene.mi_scene, **values}
 
     def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
-        """Depth (1, H, W), shading normal (3, H, W), albedo (3, H, W) at pixel centres; primary rays only."""
-        lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
-        point, normal, albedo, valid = launch(self._gbuffer, lanes, **self._camera_values(camera))
+        """What primary rays find; the rays pass through the transparent parts of opacity masks.
+
+        Returns:
+            depth (1, H, W), shading normal (3, H, W) and albedo (3, H, W) at pixel centres; emission (3, H, W), the
+            radiance that the pixel sees directly from lamps and from the environment, the mean over its area.
+        """
+        fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
+        centres = camera.centres().astype(np.float32)
+        point, normal, albedo, valid = launch(self._gbuffer, {"position": ("Point2f", centres)}, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Along the camera's axis, from its centre.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
-        image = lambda a: np.where(valid[:, None], a, 0).T.reshape(-1, camera.height, camera.width)
-        return {"depth": image(depth[:, None]).astype(np.float32), "normal": image(normal), "albedo": image(albedo)}
+        emission = np.zeros((len(centres), 3), np.float32)
+        pixels = np.flatnonzero(self._may_see_light(camera, ~valid))
+        if len(pixels):
+            lanes = {"corner": ("Point2f", np.floor(centres[pixels]))}
+            (emission[pixels],) = launch(self._emission, lanes, **fixed)
+        image = lambda a: a.T.reshape(-1, camera.height, camera.width)
+        buffers = {"depth": depth[:, None].astype(np.float32), "normal": normal, "albedo": albedo}
+        surfaces = {name: image(np.where(valid[:, None], a, 0)) for name, a in buffers.items()}
+        return {**surfaces, "emission": image(emission)}
+
+    def _may_see_light(self, camera: Camera, escapes: np.ndarray) -> np.ndarray:
+        """(H W,) bool: the pixels that may have emission, so that the others need no rays for it.
+
+        A pixel may see a lamp if it covers part of the lamp's bounding box. It is taken to see the environment if a ray
+        through its own centre or that of a neighbour `escapes` (H W,).
+        """
+        sees = np.zeros(len(escapes), bool)
+        if self.scene.environment is not None:
+            sees |= ndimage.maximum_filter(escapes.reshape(camera.height, camera.width), 3).ravel()
+        directions = camera.directions(camera.centres())
+        diagonal = np.hypot(1 / camera.matrix[0, 0], 1 / camera.matrix[1, 1])  # A pixel's, at a depth of 1.
+        for lamp in self._lamps:
+            corners = np.array([lamp.bbox().min, lamp.bbox().max])
+            box = corners / self.scene.description.units_per_metre - camera.position
+            # A ray anywhere in a pixel is at most half a diagonal away from the one through its centre.
+            margin = diagonal / 2 * np.linalg.norm(np.abs(box).max(0)) + 1e-4
+            with np.errstate(divide="ignore"):
+                to_planes = (box + np.array([[-margin], [margin]]))[:, None] / directions
+            enter, leave = to_planes.min(0).max(1), to_planes.max(0).min(1)
+            sees |= (enter <= leave) & (leave > 0)
+        return sees
 
     def transmits(self, camera: Camera) -> np.ndarray:
         """(H, W) bool: the surface at the pixel's centre lets light through, as glass does."""
         lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
-        (transmits,) = launch(self._transmits, lanes, **self._camera_values(camera))
+        (transmits,) = launch(self._transmits, lanes, masks=self.scene.masks, **self._camera_values(camera))
         return transmits.reshape(camera.height, camera.width)
 
     def photons(self, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -214,8 +254,8 @@ class Renderer:
             "u1": ("Point2f", uniform[:, 1:3]),
             "u2": ("Point2f", uniform[:, 3:5]),
         }
-        fixed = {"scene": self.scene.mi_scene, "emitter": self.emitters[emitter], **self._room}
-        return launch(self._photons[emitter], lanes, **fixed)
+        fixed = {"scene": self.scene.mi_scene, "masks": self.scene.masks, **self._room}
+        return launch(self._photons[emitter], lanes, emitter=self.emitters[emitter], **fixed)
 
 
 def _ray(corner: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:
@@ -244,24 +284,39 @@ def _splatted(pixel: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
     return np.stack([np.bincount(pixel[lit], channel, count) for channel in value[lit].T], 1)
 
 
-def _gbuffer(scene: Any, position: Any, **camera: Any) -> tuple:
-    ray = _ray(position, **camera)
-    interaction = scene.ray_intersect(ray)
+def _gbuffer(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
+    interaction = first_surface(scene, _ray(position, **camera), masks)
     valid = interaction.is_valid()
     albedo = diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
     return interaction.p, interaction.sh_frame.n, albedo, valid
 
 
-def _transmits(scene: Any, position: Any, **camera: Any) -> tuple:
-    interaction = scene.ray_intersect(_ray(position, **camera))
+def _emission(scene: Any, masks: bool, corner: Any, **camera: Any) -> tuple:
+    def step(k: Any, total: Any) -> tuple:
+        place = (mi.Point2f(mi.Float(k % _SIDE), mi.Float(k // _SIDE)) + 0.5) / _SIDE
+        interaction = first_surface(scene, _ray(corner + place, **camera), masks)
+        emitter = interaction.emitter(scene)  # The environment's, where the ray escapes.
+        return k + 1, total if emitter is None else total + mi.Color3f(emitter.eval(interaction))
+
+    # An unrolled loop compiles for a minute in a large scene, and runs no faster.
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: k < _SIDE**2, step)
+    return (total / _SIDE**2,)
+
+
+def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
+    interaction = first_surface(scene, _ray(position, **camera), masks)
     valid = interaction.is_valid()
-    flags: Any = interaction.bsdf().flags() if _any(valid) else mi.UInt32(0)
+    if not _any(valid):
+        return (False,)
+    bsdf, null = interaction.bsdf(), int(mi.BSDFFlags.Null)
+    # A mask has the flag only for its transparent parts, which rays have passed.
+    flags = dr.select(is_mask(bsdf), bsdf.flags() ^ null, bsdf.flags())
     return (valid & mi.has_flag(flags, mi.BSDFFlags.Transmission),)
 
 
-def _photons(scene: Any, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2: Any) -> tuple:
+def _photons(scene: Any, masks: bool, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2: Any) -> tuple:
     ray, weight = emitter.sample_ray(mi.Float(0), u0, u1, u2)
-    interaction = scene.ray_intersect(ray)
+    interaction = first_surface(scene, ray, masks)
     to_low, to_high = (low - ray.o) / ray.d, (high - ray.o) / ray.d
     enter, leave = dr.max(dr.minimum(to_low, to_high)), dr.min(dr.maximum(to_low, to_high))
     crosses = (enter < leave) & (leave > 0) & (enter < interaction.t)

@@ -19,6 +19,7 @@ from nlt.errors import UserError
 from nlt.scenes import importer
 from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
 from nlt.scenes.lanes import is_jit, owned
+from nlt.scenes.masks import is_mask
 from nlt.scenes.meshes import live_mesh
 from nlt.scenes.model import Triangles
 from nlt.scenes.state import SceneState, rest_state
@@ -74,6 +75,7 @@ class Scene:
         if not own_lights:
             meshes = {n: _without_emitter(m, self.shapes[n]) if m.is_emitter() else m for n, m in meshes.items()}
         self._assemble(meshes)
+        self.masks = any(is_mask(shape.bsdf) for shape in self.shapes.values())
         self._centres = {movable.name: self._centre(movable) for movable in self.movables}
         self.set_state(rest_state(description, experiment))
 

@@ -12,6 +12,7 @@ from nlt.errors import UserError
 from nlt.scenes.assembly import Scene, Shape
 from nlt.scenes.description import MATERIALS
 from nlt.scenes.lanes import freeze, is_jit, launch
+from nlt.scenes.masks import first_surface, is_mask, is_transparent
 from nlt.scenes.state import SceneState, rest_state
 from nlt.scenes.views import Views
 
@@ -33,7 +34,8 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
 
     Points are uniform by area on what may come to be seen: on movable objects, and on what is in direct sight of one
     of 64 random views while all movable objects are removed. (Glass is a surface, as in the G-buffer: it hides what is
-    behind it.) In a scene with a `room`, nothing is further from it than 0.6 m, the depth of a window's recess.
+    behind it. The transparent parts of opacity masks have no points and hide nothing.) In a scene with a `room`,
+    nothing is further from it than 0.6 m, the depth of a window's recess.
 
     Raises:
         UserError: less than a thousandth of the scene's surface is so.
@@ -54,6 +56,9 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
                 )
             width = min(int(1.1 * (count - found) * max(tried, 1) / max(found, 1)) + 64, _BATCH)
             which, position, uv = uniform_points(shapes, width, rng)
+            if scene.masks:
+                solid = ~_transparent(shapes, which, uv)
+                which, position, uv = which[solid], position[solid], uv[solid]
             seen = np.flatnonzero(in_sight(position, owners[which] >= 0))
             kept.append((which[seen], position[seen], uv[seen]))
             found, tried = found + len(seen), tried + width
@@ -118,14 +123,27 @@ class _InSight:
                     "origin": ("Point3f", np.tile(eye * units, (len(rows), 1))),
                     "reach": ("Vector3f", (position[rows] - eye) * units),
                 }
-                seen[rows] = launch(self._clear, lanes, scene=self.scene.mi_scene)[0]
+                seen[rows] = launch(self._clear, lanes, scene=self.scene.mi_scene, masks=self.scene.masks)[0]
         return seen
 
 
-def _clear(scene: Any, origin: Any, reach: Any) -> tuple:
+def _clear(scene: Any, masks: bool, origin: Any, reach: Any) -> tuple:
     ray = mi.Ray3f(origin, reach)
+    if masks:
+        return (first_surface(scene, ray, masks).t > 1 - _SURFACE,)
     ray.maxt = 1 - _SURFACE  # type: ignore[assignment]
     return (~scene.ray_test(ray) if is_jit() else not scene.ray_test(ray),)
+
+
+def _transparent(shapes: list[Shape], which: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(n,) bool: points at texture coordinates uv (n, 2) of shapes which (n,) lie on a transparent part of a mask."""
+    transparent = np.zeros(len(which), bool)
+    for k in np.unique(which):
+        bsdf, mine = shapes[k].bsdf, which == k
+        if is_mask(bsdf):
+            kernel = lambda uv, bsdf=bsdf: (is_transparent(bsdf, _interaction(uv)),)
+            (transparent[mine],) = launch(kernel, {"uv": ("Point2f", uv[mine])})
+    return transparent
 
 
 def _barycentric(uniform: np.ndarray) -> np.ndarray:
@@ -164,12 +182,18 @@ def surface(shape: Shape, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Albedo and emitted radiance (n, 3) at texture coordinates (n, 2) of a shape."""
 
     def kernel(uv: Any) -> tuple:
-        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
-        interaction.uv = uv
-        interaction.wi = mi.Vector3f(0, 0, 1)
-        interaction.t = mi.Float(1)  # type: ignore[assignment]
+        interaction = _interaction(uv)
         emitted = shape.emitter.eval(interaction) if shape.emitter else mi.Color3f(0 * uv.x)
         return diffuse_albedo(shape.bsdf, interaction), mi.Color3f(emitted)
 
     albedo, emission = launch(kernel, {"uv": ("Point2f", uv)})
     return albedo, emission
+
+
+def _interaction(uv: Any) -> Any:
+    """An interaction at texture coordinates, seen along the normal."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
+    interaction.uv = uv
+    interaction.wi = mi.Vector3f(0, 0, 1)
+    interaction.t = mi.Float(1)  # type: ignore[assignment]
+    return interaction

@@ -478,7 +478,7 @@ def _precision_and_flops(clock: Clock, method: RenderingModule) -> dict[str, Any
 
 def _touches(factor: str, method: Method) -> bool:
     if factor in ("points", "photons"):
-        return any(name.startswith(factor[:-1]) for name in method.inputs)
+        return any(name.startswith(factor[:-1]) for name in method.fields)
     return factor != "width" or isinstance(method, RenderingModule)
 
 

@@ -240,7 +240,7 @@ def curves(results: Results) -> dict[str, list[str]]:
 
     The cheapest comes first.
     """
-    families: dict[str, dict[str, tuple[float, float]]] = {}
+    families: dict[tuple[str, str], dict[str, tuple[float, float]]] = {}
     variants: dict[str, list[str]] = {}
     for run in results.runs:
         if run["status"] != OK:
@@ -249,7 +249,9 @@ def curves(results: Results) -> dict[str, list[str]]:
         if at and run["method"] not in variants.setdefault(name, []):
             variants[name].append(run["method"])
         elif run["spp"] and not at:
-            families.setdefault(run["family"], {})[run["method"]] = (run["spp"], run["pixel_fraction"])
+            # The label tells denoising from guided denoising, which are of one class.
+            family = (run["family"], label(name).rpartition(" (")[0])
+            families.setdefault(family, {})[name] = (run["spp"], run["pixel_fraction"])
     time = partial(results.mean, key="time_per_frame_s")
     curves = {f"{label(name)}, variants": sorted(found, key=time) for name, found in variants.items() if len(found) > 1}
     for members in families.values():

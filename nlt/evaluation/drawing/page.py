@@ -20,7 +20,7 @@ import yaml
 from PIL import Image
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.claims import Claim, Comparison
+from nlt.evaluation.claims import BELOW_FLOOR, Claim, Comparison
 from nlt.evaluation.claims import text as claim_text
 from nlt.evaluation.drawing.figures import bar, curves
 from nlt.evaluation.drawing.gallery import FAILURES, Shown, failures
@@ -264,7 +264,7 @@ def _titled(table: Table, grid: str) -> str:
 def _table(results: Results, table: Table, number: int) -> str:
     """The best of each metric is bold."""
     keys = [key for key, _ in table.sources]
-    chosen = [(_best(results, key), c) for c, key in enumerate(keys) if key in METRICS]
+    chosen = [(results.best(key), c) for c, key in enumerate(keys) if key in METRICS]
     best = {(results.methods.index(method), c) for method, c in chosen if method is not None}
     origins = _Origins(
         _measured(results),
@@ -272,14 +272,10 @@ def _table(results: Results, table: Table, number: int) -> str:
         [_trainings(results, method) for method in results.methods],
         [[_numbers(of, method, key) for key, of in table.sources] for method in results.methods],
     )
+    if len(table.rows) > len(results.methods):
+        origins.rows.append("manifest.json, floor")
+        origins.cells.append([repr(results.floor.get(key, "not measured")) for key, _ in table.sources])
     return _titled(table, _grid(f"table-{number}", table.title, table, origins, best))
-
-
-def _best(results: Results, key: str) -> str | None:
-    means = {method: results.mean(method, key) for method in results.methods}
-    means = {method: mean for method, mean in means.items() if math.isfinite(mean)}
-    choose = min if QUANTITIES[key].direction == "lower" else max
-    return choose(means, key=means.__getitem__, default=None)
 
 
 def _measured(results: Results) -> str:
@@ -396,10 +392,7 @@ def _claims(results: Results, claims: list[Claim]) -> str:
             claim.id,
             "",
             ["against", "metric", "margin", "verdict"],
-            [
-                [label(c.method), label(c.other), heading(c.metric), _margin(c), f"{_MARKS[c.verdict]} {c.verdict}"]
-                for c in claim.comparisons
-            ],
+            [[label(c.method), label(c.other), heading(c.metric), _margin(c), _verdict(c)] for c in claim.comparisons],
         )
         origins = _Origins(f"claims.json; computed from runs.csv and views.csv, {_measured(results)}", [""] * 4)
         lines.append(
@@ -414,6 +407,11 @@ def _claims(results: Results, claims: list[Claim]) -> str:
         f'<p class="note">At this scale {count}. A margin is positive where the comparison is as claimed; in brackets '
         f"its 95% interval over test images and seeds. A line opens.</p>{''.join(lines)}</section>"
     )
+
+
+def _verdict(comparison: Comparison) -> str:
+    below = f"; {BELOW_FLOOR}" if comparison.below_floor else ""
+    return f"{_MARKS[comparison.verdict]} {comparison.verdict}{below}"
 
 
 def _margin(comparison: Comparison) -> str:

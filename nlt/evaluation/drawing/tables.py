@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +20,7 @@ _FEATURE_LAYERS = tuple(key for key in METRICS if key.startswith("feature_l1_"))
 _MORE = ("unbiased_mse", "psnr", "flip", "kid", *_FEATURE_LAYERS)
 _SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
 _NONE = "–"
+_FLOOR = "reference (its halves)"
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,12 @@ def tables(results: Results) -> list[Table]:
             f" After the slash the paper's figures ({paper()[table]['scale']}, a GPU). Another scale and other scenes: "
             "compare the order of the methods, not the numbers."
         )
+    if results.floor:
+        note += (
+            " The last row judges one half of the reference against the other: a perfect picture would differ from the "
+            "reference, which is their mean, by a quarter of this MSE. A value marked ≈ is closer to the best of its "
+            "column than the last row is to a perfect value: the reference cannot tell the two apart."
+        )
     teachers = [f"{teacher} in {s}" for s, teacher in results.manifest.get("teachers", {}).items() if teacher != "path"]
     if teachers:
         note += f" Path tracing rows, OIDN's and denoising's input: traced by {', '.join(teachers)}."
@@ -98,8 +105,9 @@ def _name(results: Results, method: str) -> str:
 
 
 def _cell(results: Results, method: str, key: str) -> str:
-    std = results.std(method, key)
-    return text(key, results.mean(method, key)) + (f" ± {text(key, std)}" if math.isfinite(std) else "")
+    mean, std, best = results.mean(method, key), results.std(method, key), results.best(key)
+    is_near = best not in (None, method) and results.is_below_floor(key, mean - results.mean(str(best), key))
+    return text(key, mean) + (f" ± {text(key, std)}" if math.isfinite(std) else "") + " ≈" * is_near
 
 
 def _table(
@@ -115,13 +123,18 @@ def _table(
         theirs = published(table, method)
         cells = [cell(of, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key, of in sources]
         rows.append([_name(results, method), *cells])
+    if cell is _cell and any(key in results.floor for key, _ in sources):
+        rows.append([_FLOOR, *(text(key, results.floor.get(key)) for key, _ in sources)])
     return Table(title, note, [heading(key) for key, _ in sources], rows, sources)
 
 
 def write_tables(results: Results) -> None:
     """table.csv with every number unrounded, table.md and table.tex."""
     found = tables(results)
-    write_rows(results.directory / "table.csv", [_summary(results, method) for method in results.methods])
+    rows = [_summary(results, method) for method in results.methods]
+    if results.floor:
+        rows.append({"method": _FLOOR, "status": OK, "n_test": results.manifest["n_test"], **results.floor})
+    write_rows(results.directory / "table.csv", rows)
     write_texts(results, "table", found)
 
 
@@ -163,13 +176,14 @@ def _markdown(found: list[Table], source: str) -> str:
 
 
 _LATEX = {
-    **{c: f"\\{c}" for c in "&%$#_{}"}, "±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "–": "--",
+    **{c: f"\\{c}" for c in "&%$#_{}"}, "±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "≈": r"$\approx$",
+    "–": "--",
 }  # fmt: skip
 
 
 def _latex(found: list[Table]) -> str:
     """For a document with \\usepackage{booktabs}."""
-    escape = lambda line: re.sub(r"[&%$#_{}±↓↑–]", lambda match: _LATEX[match[0]], line)
+    escape = lambda line: re.sub(r"[&%$#_{}±↓↑≈–]", lambda match: _LATEX[match[0]], line)
     lines = []
     for table in found:
         caption = escape(f"{table.title}. {table.note}".strip())
@@ -186,6 +200,11 @@ def _latex(found: list[Table]) -> str:
 def live_header() -> str:
     """Headings for `live_row`."""
     return f"{'method':22}" + "".join(f"{heading(key):>18}" for key in COLUMNS)
+
+
+def live_floor(floor: Mapping[str, float]) -> str:
+    """The reference's halves against each other, for the terminal."""
+    return f"{_FLOOR:22}" + "".join(f"{text(key, floor.get(key)):>18}" for key in COLUMNS)
 
 
 def live_row(run: dict[str, Any]) -> str:

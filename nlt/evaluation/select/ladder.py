@@ -131,7 +131,7 @@ class Ladder:
         """The full model first, then so that the first few of them are spread over methods, sizes and counts."""
         columns = []
         for method in reversed(self.methods):
-            inputs = self.build(Candidate(method, self.sizes[-1], None, None)).inputs
+            inputs = self.build(Candidate(method, self.sizes[-1], None, None)).fields
             reads = lambda prefix, names=inputs: any(name.startswith(prefix) for name in names)
             points = self.points if reads("point_") else (None,)
             photons = self.photons if reads("photon_") else (None,)

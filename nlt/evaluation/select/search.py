@@ -140,7 +140,7 @@ class Search:
 
     def _step_s(self, module: RenderingModule) -> float:
         """Seconds of a training step: the least of two, after a first."""
-        data, wanted = self.trials.split("train", module.inputs), self._batch_size
+        data, wanted = self.trials.split("train", module.fields), self._batch_size
         batch = default_collate([data[k % len(data)] for k in range(wanted)])
         batch = {name: value.to(self.device) for name, value in batch.items()}
         module = module.to(self.device).train()

@@ -99,7 +99,7 @@ class Trials:
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
         metrics, found = ImageMetrics(perceptual=False).to(self.device), []
-        for cpu_batch in DataLoader(self.split(split, module.inputs), batch_size=_BATCH, collate_fn=collated):
+        for cpu_batch in DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=collated):
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
             with self.policy.applied(self.device):
                 prediction = module(batch)

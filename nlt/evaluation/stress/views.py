@@ -116,7 +116,7 @@ class SuiteViews:
 
     def predict(self, method: Method, batch: Batch) -> Tensor:
         """The radiance of a batch, as `nlt compare` computes it."""
-        if "traced" in method.inputs:
+        if "traced" in method.fields:
             name = f"traced_{method.spp}"
             if name not in batch:
                 place = f"{self.suites.file}: traced"
@@ -213,7 +213,7 @@ def _reads(method: Method, change: str) -> bool:
     if change == "pixels":
         return "one_in" in getattr(method, "hparams", ())
     inputs = {"points": "point_visible", "photons": "photon_flux", "spp": "noisy_input"}
-    return change not in inputs or inputs[change] in method.inputs
+    return change not in inputs or inputs[change] in method.fields
 
 
 @contextmanager

@@ -1,0 +1,76 @@
+"""How long does Open Image Denoise take in each of its modes? The images are random, which does not change its times.
+
+python benchmarks/oidn.py                              # writes results/benchmarks/oidn.json and oidn.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import get_args
+
+import torch
+
+from nlt.baselines.path_tracing import OpenImageDenoise, Quality
+from nlt.data.files import write_bytes
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.paths import PROJECT
+
+SIZES = (16, 64, 128, 256)  # 16 shows what does not grow with the pixels
+WARM_UP, TIMED, ROUNDS = 3, 10, 4
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=PROJECT / "results/benchmarks")
+    options = parser.parse_args()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    record = {**origin(), **surroundings(device), "load_average": {"before": os.getloadavg()}}
+    times: dict[tuple[str, int], list[float]] = {}
+    for _ in range(ROUNDS):  # other work on the machine then slows every mode alike
+        for quality in get_args(Quality):
+            for size in SIZES:
+                times.setdefault((quality, size), []).extend(measure(quality, size, device))
+    rows = [
+        {"quality": q, "size": n, "ms": statistics.median(ms), "fastest_ms": min(ms)} for (q, n), ms in times.items()
+    ]
+    record["load_average"]["after"] = os.getloadavg()
+    before, after = (load[0] for load in record["load_average"].values())
+    note = (
+        "Milliseconds of `denoise` alone: median, in brackets the fastest. "
+        f"{record['device']}; load average {before:.1f} before, {after:.1f} after. `python benchmarks/oidn.py`"
+    )
+    text = f"# Open Image Denoise\n\n{table(times)}\n\n{note}\n"
+    write_bytes(options.out / "oidn.json", (json.dumps({**record, "rows": rows}, indent=1) + "\n").encode())
+    write_bytes(options.out / "oidn.md", text.encode())
+    print(text)
+
+
+def measure(quality: Quality, size: int, device: torch.device) -> list[float]:
+    """Milliseconds of each timed image of size x size pixels."""
+    traced, albedo, normal = torch.rand(3, 1, 3, size, size, device=device)
+    batch = {"traced": traced, "albedo": albedo, "normal": normal, "exposure": torch.ones(1, device=device)}
+    method, found = OpenImageDenoise(quality=quality), []
+    for _ in range(WARM_UP + TIMED):
+        start = time.perf_counter()
+        method(batch).cpu()  # waits for the device
+        found.append(1e3 * (time.perf_counter() - start))
+    return found[WARM_UP:]
+
+
+def table(times: dict[tuple[str, int], list[float]]) -> str:
+    """A row per mode: its median and, in brackets, its fastest time at each size."""
+    lines = [f"| mode | {' | '.join(f'{n}x{n}' for n in SIZES)} |", f"|---|{'---:|' * len(SIZES)}"]
+    for quality in get_args(Quality):
+        found = [times[quality, size] for size in SIZES]
+        lines.append(f"| {quality} | {' | '.join(f'{statistics.median(ms):.1f} ({min(ms):.1f})' for ms in found)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

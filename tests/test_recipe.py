@@ -1,0 +1,136 @@
+"""The recipe of a training: schedule, clipping, the rate of embeddings, and how the U-Net's output becomes an image."""
+
+from __future__ import annotations
+
+import lightning as L
+import pytest
+import torch
+from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
+from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, SequentialLR
+from torch.utils.data import DataLoader
+
+from nlt.baselines.cnn import CNN
+from nlt.baselines.denoising import SparseDenoising
+from nlt.baselines.feature_projection import FeatureProjection
+from nlt.errors import UserError
+from nlt.models.module import warm_up_and_cosine
+from nlt.models.nlt import NeuralLightTransport
+from nlt.training import Checkpoints
+
+SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
+QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False, "accelerator": "cpu"}
+
+
+def loader(count):
+    return DataLoader([synthetic_batch(seed=k) for k in range(count)], batch_size=None)
+
+
+class Rates(L.Callback):
+    """Keeps the learning rates of every step, and the norm of the gradients that the optimiser sees."""
+
+    def __init__(self):
+        self.rates, self.norms = [], []
+
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
+        self.rates.append([group["lr"] for group in optimizer.param_groups])
+
+    def on_train_batch_end(self, trainer, pl_module, *_):
+        self.norms.append(float(torch.cat([p.grad.flatten() for p in pl_module.parameters()]).norm()))
+
+
+def test_the_cosine_schedule_is_torchs():
+    """5 % of linear warm-up, then half a cosine to zero, as PyTorch's own schedulers have it."""
+    steps, warm_up = 200, 10
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+    parts = [LinearLR(optimizer, 1 / warm_up, 1, warm_up - 1), CosineAnnealingLR(optimizer, steps - warm_up)]
+    schedule = SequentialLR(optimizer, parts, [warm_up])
+    for step in range(steps):
+        assert warm_up_and_cosine(step, steps) == pytest.approx(optimizer.param_groups[0]["lr"], abs=1e-9), step
+        optimizer.step()
+        schedule.step()
+    assert warm_up_and_cosine(steps, steps) == pytest.approx(0, abs=1e-12)
+    assert [warm_up_and_cosine(step, 1) for step in (0, 1)] == [1, 1]
+
+
+def test_the_rate_changes_at_every_step_and_resumes_exactly(tmp_path):
+    """Eight steps in one go, or four, a checkpoint and four more: the same rates, the same weights to the bit."""
+    data = loader(4)
+
+    def fit(*callbacks, **given):
+        torch.manual_seed(0)
+        model = FeatureProjection(**SIZE, lr_schedule="cosine", embedding_lr=0.1, learning_rate=0.01)
+        rates, kept = Rates(), Checkpoints()
+        trainer = L.Trainer(default_root_dir=tmp_path, max_steps=8, callbacks=[rates, kept, *callbacks], **QUIET)
+        trainer.fit(model, data, **given)
+        return kept.best_model_path, model, rates.rates
+
+    _, through, whole = fit()
+    steps = [0.01 * warm_up_and_cosine(step, 8) for step in range(8)]
+    torch.testing.assert_close(torch.tensor(whole), torch.tensor([[rate, 0.1 * rate] for rate in steps]))
+    half, _, first = fit(_StopAfter(4))
+    _, resumed, rest = fit(ckpt_path=half, weights_only=True)
+    assert first + rest == whole
+    for a, b in zip(through.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+class _StopAfter(L.Callback):
+    def __init__(self, steps):
+        self.steps = steps
+
+    def on_train_batch_end(self, trainer, *_):
+        trainer.should_stop = trainer.global_step >= self.steps
+
+
+def test_gradients_are_clipped_in_the_warm_up_alone(tmp_path):
+    rates, share = Rates(), 0.5
+    model = CNN(width=4, clip_share=share)
+    L.Trainer(default_root_dir=tmp_path, max_steps=8, gradient_clip_val=1e-3, callbacks=[rates], **QUIET).fit(
+        model, loader(8)
+    )
+    assert all(norm == pytest.approx(1e-3, rel=1e-3) for norm in rates.norms[:4])
+    assert all(norm > 2e-3 for norm in rates.norms[4:])
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+def test_a_share_is_between_0_and_1(share):
+    with pytest.raises(UserError, match=r"model\.init_args\.clip_share: must be between 0 and 1"):
+        CNN(width=1, clip_share=share)
+
+
+def test_a_demodulated_output():
+    """Albedo times three channels, plus three, over the exposure, plus what lamps in view emit."""
+    batch, method = synthetic_batch(), CNN(width=4, output="demodulated").eval()
+    channels = torch.randn(2, 6, 16, 16)
+    method.unet.forward = lambda *_: channels
+    expected = batch["albedo"] * channels[:, :3] + channels[:, 3:]
+    expected = expected / batch["exposure"].view(-1, 1, 1, 1) + batch["emission"]
+    torch.testing.assert_close(method(batch), expected)
+    assert method.fields == (*method.inputs, "emission")
+    dark = CNN(width=4, output="demodulated", add_emission=False)
+    assert dark.fields == dark.inputs and not dark(batch).isnan().any()
+
+
+def test_a_method_without_albedo_predicts_radiance():
+    one, other = (SparseDenoising(gbuffer=False, width=4, output=output) for output in ("radiance", "demodulated"))
+    assert one.state_dict().keys() == other.state_dict().keys() and one.fields == other.fields
+    assert one.unet.conv_out.out_channels == other.unet.conv_out.out_channels == 3
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_training_computes_the_photons_that_are_seen(points):
+    """The same map and the same gradients as from all photons, and the network is given fewer."""
+    batch = {k: v.double() if v.is_floating_point() else v for k, v in synthetic_batch().items()}
+    method = NeuralLightTransport(points=points, photons=True, **SIZE).double()
+    given = []
+    method.photon_network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0].numel() // 9))
+    images, gradients = [], []
+    for training in (True, False):
+        method.train(training).zero_grad()
+        images.append(method(batch))
+        images[-1].square().mean().backward()
+        gradients.append([parameter.grad.clone() for parameter in method.parameters()])
+    torch.testing.assert_close(images[0], images[1], rtol=1e-9, atol=1e-12)
+    for seen, every in zip(*gradients, strict=True):
+        torch.testing.assert_close(seen, every, rtol=1e-8, atol=1e-12)
+    assert 0 < given[0] < given[1] == 2 * PHOTONS
