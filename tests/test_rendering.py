@@ -13,6 +13,7 @@ import trimesh
 from conftest import LIGHT, demo_meshes, first_hit, plain_scene, write_room, write_yaml
 from scipy import stats
 
+from nlt.baselines.cnn import CNN
 from nlt.errors import UserError
 from nlt.rendering import renderer as renderer_module
 from nlt.rendering import variant as variant_module
@@ -482,33 +483,36 @@ def test_photons_of_the_moved_light(renderer, demo):
 # ---- the lemma ------------------------------------------------------------------------------------------
 
 
-def gradients(network, inputs, targets):
-    """(n, parameters): of the mean squared error against each target."""
+def gradients(network, predict, targets):
+    """(n, parameters): of the mean squared error of what `predict` makes of the parameters against each target."""
 
     def loss(parameters, target):
-        return ((torch.func.functional_call(network, parameters, inputs) - target) ** 2).mean()
+        return ((predict(parameters) - target) ** 2).mean()
 
     each = torch.func.vmap(torch.func.grad(loss), (None, 0))(dict(network.named_parameters()), targets)
     return torch.cat([g.flatten(1) for g in each.values()], 1).detach().numpy()
 
 
-def test_lemma(renderer, demo):
+@pytest.mark.parametrize("output", ["radiance", "demodulated"])
+def test_lemma(renderer, demo, output):
     """Eq. 3: noisy targets give the gradient of the noise-free image in expectation; clamped ones do not."""
     renderer.scene.set_state(away("moving_lights", demo))
     camera = sample_view(demo, 16, np.random.default_rng(9))
-    buffer = renderer.gbuffer(camera)
-    surfaces = [buffer[name] for name in ("depth", "normal", "albedo")]
-    inputs = torch.from_numpy(np.concatenate(surfaces)[None].astype(float))
+    buffers = {name: torch.from_numpy(image[None].astype(float)) for name, image in renderer.gbuffer(camera).items()}
+    inputs = torch.cat([buffers[name] for name in ("depth", "normal", "albedo")], 1)
     torch.manual_seed(0)
-    network = torch.nn.Sequential(torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, 3, 1)).double()
+    method, channels = CNN(width=1, output=output), 6 if output == "demodulated" else 3
+    network = torch.nn.Sequential(torch.nn.Conv2d(7, 4, 1), torch.nn.Tanh(), torch.nn.Conv2d(4, channels, 1)).double()
+    batch = {**buffers, "exposure": torch.ones(1, dtype=torch.float64)}
+    predict = lambda parameters: method.to_radiance(batch, torch.func.functional_call(network, parameters, inputs))
     images = lambda spp, seeds: torch.from_numpy(
         np.stack([renderer.radiance(camera, spp, seed) for seed in seeds])[:, None].astype(float)
     )
     noisy = images(1, range(500))
-    exact = gradients(network, inputs, images(64, range(1000, 1040)))
+    exact = gradients(network, predict, images(64, range(1000, 1040)))
 
     def worst(targets):
-        p = stats.ttest_ind(gradients(network, inputs, targets), exact, equal_var=False).pvalue
+        p = stats.ttest_ind(gradients(network, predict, targets), exact, equal_var=False).pvalue
         return p.min() * len(p)
 
     assert worst(noisy) > 1e-3

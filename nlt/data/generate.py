@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -10,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -114,7 +115,7 @@ def _choose_reference_spp(spec: DatasetSpec, directory: AnyPath, missing: Iterab
 def needed_spp(spec: DatasetSpec, mse: float) -> int:
     """The samples per pixel at which halves whose MSE is `mse` on the pilot views reach `reference_mse`.
 
-    The MSE falls with the inverse of the samples per pixel. They are rounded up to a power of two.
+    The MSE is taken to fall with the inverse of the samples per pixel. They are rounded up to a power of two.
     """
     pilot = min(PILOT_SPP, spec.reference_spp)
     needed = max(pilot, pilot * mse / spec.reference_mse)
@@ -143,7 +144,9 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
 
 def _with_reference_spp(spec: DatasetSpec, spp: int) -> DatasetSpec:
     """The spec with a fixed number of samples per pixel for its references, as `SampleRenderer` reads it."""
-    return replace(spec, reference_spp=spp, reference_mse=0.0)
+    fixed = copy.copy(spec)  # unlike dataclasses.replace, this keeps the descriptions that the user's files gave
+    fixed.reference_spp, fixed.reference_mse = spp, 0.0
+    return fixed
 
 
 def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine) -> None:

@@ -137,6 +137,7 @@ def _subject(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
     return {
         "comparison": comparison.name,
         "table": comparison.table,
+        "variant": comparison.variant and comparison.variant.stem,
         "methods": comparison.methods,
         "seeds": comparison.seeds,
         "dataset": test.directory.name,

@@ -93,7 +93,10 @@ class NeuralLightTransport(RenderingModule):
         if photons is not None:
             clouds.append((photons, batch["photon_hit"], batch["photon_valid"]))
         maps = self.gbuffer_and(batch, clouds)
-        return join([maps, self._seen_photons(batch)]) if self.hparams["photons"] and photons is None else maps
+        if not self.hparams["photons"] or photons is not None:
+            return maps
+        assert isinstance(maps, Tensor)  # sparse maps are for inference
+        return join([maps, self._seen_photons(batch)])
 
     def _seen_photons(self, batch: Batch) -> Tensor:
         """The map (B, photon_width, H, W) of the photons, whose features are computed where the view sees them."""

@@ -83,15 +83,16 @@ class PhotonNetwork(nn.Sequential):
     """Sec. "Implementation Details": a fully connected ResNet, each photon for itself: (B, P, in_features) ->
     (B, P, features)."""
 
-    def forward(self, photons: Tensor) -> Tensor:
-        first, *blocks = self
-        x = exactly(first, photons)
-        for block in blocks:
-            x = block(x)
-        return x
-
     def __init__(self, in_features: int, features: int = 64, depth: int = 2) -> None:
         super().__init__(
             nn.Linear(in_features, features),
             *(ResidualBlock(features, features // 2, features) for _ in range(depth)),
         )
+
+    def forward(self, photons: Tensor) -> Tensor:
+        first, *blocks = self
+        assert isinstance(first, nn.Linear)
+        x = exactly(first, photons)
+        for block in blocks:
+            x = block(x)
+        return x

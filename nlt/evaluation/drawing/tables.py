@@ -64,6 +64,8 @@ def tables(results: Results) -> list[Table]:
             f" After the slash the paper's figures ({paper()[table]['scale']}, a GPU). Another scale and other scenes: "
             "compare the order of the methods, not the numbers."
         )
+    if variant := results.manifest.get("variant"):
+        note += f" Every training has the output and settings of configs/variant/{variant}.yaml, not the paper's."
     if results.floor:
         note += (
             " The last row judges one half of the reference against the other: a perfect picture would differ from the "
