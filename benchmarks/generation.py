@@ -32,11 +32,11 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from nlt.data.engines import Process, cores
+from nlt.bench.bare import Bare
+from nlt.data.engines import Process, available_cpus
 from nlt.data.generate import generate, render_shard
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.evaluation.bench.bare import Bare
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.paths import PROJECT
 from nlt.scenes.assembly import load_source
@@ -47,7 +47,7 @@ SPLITS = ("train", "test")
 
 def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[str, Any]:
     """Seconds of every turn of one shard, by (split, who), and kernels compiled after the first round."""
-    render = SampleRenderer(spec, 0, max(1, cores() // barrier.parties))
+    render = SampleRenderer(spec, 0, max(1, available_cpus() // barrier.parties))
     bare = {"bare": Bare(render, frozen=False), "frozen": Bare(render, frozen=True)}
     compiled = dict.fromkeys((*bare, "generation"), 0)
     seconds: dict[str, list[float]] = {f"{split} {who}": [] for split in SPLITS for who in compiled}

@@ -32,7 +32,7 @@ import torch
 from tqdm import tqdm
 
 from nlt.data.datamodule import LightTransportDataModule
-from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.data.generate import generate
 from nlt.data.spec import DatasetSpec, load_spec, read_configs
@@ -218,7 +218,7 @@ def main() -> None:
     test = LightTransportDataset(base, spec.without_train(), "test", module.fields)
     batches = [
         {name: value.to(device) for name, value in batch.items()}
-        for batch in torch.utils.data.DataLoader(test, batch_size=16, collate_fn=collated)
+        for batch in torch.utils.data.DataLoader(test, batch_size=16, collate_fn=identity_collate)
     ]
     rows: list[Row] = []
     for seed in range(options.seeds):

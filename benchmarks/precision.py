@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader
 
-from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.spec import load_spec
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.provenance import origin, surroundings
@@ -35,7 +35,7 @@ def judge(method: RenderingModule, dataset: LightTransportDataset, policy: Polic
     """Means over the views of the metrics in KEYS."""
     metrics = ImageMetrics(perceptual=False)
     with policy.applied(torch.device("cpu")):
-        for batch in DataLoader(dataset, batch_size=16, collate_fn=collated):
+        for batch in DataLoader(dataset, batch_size=16, collate_fn=identity_collate):
             metrics.update(method(batch), batch["reference_a"], batch["reference_b"], batch["exposure"])
     values = metrics.compute()
     return {key: float(values[key]) for key in KEYS}

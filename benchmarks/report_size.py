@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.drawing.page import PAGE
-from nlt.evaluation.drawing.report import draw
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, MANIFEST, RUNS, VIEWS, load, write_images
 from nlt.paths import PROJECT
+from nlt.report.draw import draw
+from nlt.report.page import PAGE
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from nlt.data.files import write_bytes
 from nlt.evaluation.results import read_rows, write_rows
-from nlt.evaluation.select.report import summary
+from nlt.select.output import summary
 
 # Directory below results/select: config of configs/select.
 CASES = {"static_egg": "static_egg", "fixed_lights": "fixed_lights", "moving_lights": "demo"}

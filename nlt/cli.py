@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from nlt import __version__
-from nlt.errors import UserError, as_mistake
+from nlt.errors import UserError, to_user_error
 from nlt.waiting import wait_passively
 
 _LIGHTNING = {
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"nlt: error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"nlt: error: {as_mistake(error)}", file=sys.stderr)
+        print(f"nlt: error: {to_user_error(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("nlt: interrupted; run the same command again to go on", file=sys.stderr)
@@ -77,12 +77,7 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "data":
         _run_data(options)
     elif options.command == "compare":
-        from nlt.evaluation.compare import compare
-        from nlt.evaluation.comparison import Comparison
-
-        chosen = (options.scale, options.data, options.methods, options.seeds, options.precision)
-        comparison, slurm = Comparison.load(options.config, *chosen), dict(options.slurm)
-        compare(comparison, options.out, options.workers, options.scheduler, slurm, options.train_images)
+        _compare(options)
     elif options.command == "export":
         from nlt.evaluation.export import export
 
@@ -92,34 +87,53 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "bench":
         _bench(options)
     elif options.command == "select":
-        from nlt.evaluation.select.run import select
+        from nlt.select.run import select
 
         select(options.config, options.minutes, options.out, options.advice)
     elif options.command == "stress":
-        from nlt.evaluation.stress.run import stress
+        from nlt.stress.run import stress
 
         how = (options.methods, options.suites, options.manifest, options.views)
         stress(options.config, options.out, options.scale, options.data, *how)
     elif options.command == "report":
-        from nlt.evaluation.drawing.report import draw
-
-        draw(options.directory, options.megabytes)
+        _draw(options.directory, options.megabytes)
     elif options.command == "dashboard":
-        from nlt.evaluation.drawing.dashboard import dashboard
+        from nlt.report.dashboard import dashboard
 
         dashboard(options.directory, options.port)
     elif options.command == "scenes":
         _scenes(options)
     elif options.command == "teachers":
-        from nlt.evaluation.teachers import teachers
+        from nlt.bench.teachers import teachers
 
         size = options.resolution
         teachers(options.names, options.out, options.seconds, size, options.views, options.experiment, options.seed)
     return 0
 
 
+def _compare(options: argparse.Namespace) -> None:
+    from nlt.evaluation.compare import compare
+    from nlt.evaluation.comparison import Comparison
+    from nlt.evaluation.results import load
+    from nlt.report.tables import write_tables
+
+    chosen = (options.scale, options.data, options.methods, options.seeds, options.precision)
+    comparison, slurm = Comparison.load(options.config, *chosen), dict(options.slurm)
+    where = (options.out, options.workers, options.scheduler, slurm)
+    directory = compare(comparison, *where, options.train_images, lambda directory: write_tables(load(directory)))
+    _draw(directory)
+    print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
+
+
+def _draw(directory: str | Path, megabytes: int | None = None) -> None:
+    from nlt.report.draw import draw
+    from nlt.stress.figures import stress_section
+
+    draw(directory, megabytes, [stress_section])
+
+
 def _bench(options: argparse.Namespace) -> None:
-    from nlt.evaluation.bench.run import bench
+    from nlt.bench.run import bench
 
     bench(
         out=options.out,
@@ -348,7 +362,7 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
 
 def _run_data(options: argparse.Namespace) -> None:
     if options.action == "show":
-        from nlt.evaluation.show import show_sample
+        from nlt.report.sample import show_sample
 
         print(show_sample(options.dataset, options.split, options.index, options.output))
     elif options.action == "verify":
@@ -386,7 +400,7 @@ def _experiment(text: str) -> str:
 
 
 def _suite(text: str) -> str:
-    from nlt.data.suites import SUITES
+    from nlt.stress.suites import SUITES
 
     if text not in SUITES:
         raise argparse.ArgumentTypeError(f"must be one of {', '.join(SUITES)}, is {text!r}")

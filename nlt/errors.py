@@ -9,6 +9,6 @@ class DivergedError(UserError):
     """A training whose loss, or a method whose prediction, is not finite."""
 
 
-def as_mistake(error: OSError) -> UserError:
+def to_user_error(error: OSError) -> UserError:
     """No space, no permission and the like: what is written stays."""
     return UserError(f"{error.filename or 'nlt'}: {error.strerror or error}; set it right and run again")

@@ -12,10 +12,10 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 from tensorboard import program
 
-from nlt.evaluation.drawing.dashboard import write_logs
-from nlt.evaluation.drawing.page import PAGE
-from nlt.evaluation.drawing.report import draw
 from nlt.evaluation.results import load
+from nlt.report.dashboard import write_logs
+from nlt.report.draw import draw
+from nlt.report.page import PAGE
 
 
 def report(page: Page, directory: Path, path: Path) -> None:

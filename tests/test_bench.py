@@ -9,13 +9,13 @@ import torch
 from synthetic import POINTS, SCENES, synthetic_batch
 from tiny import DATASET, SCALE, write
 
+from nlt.bench import ceilings
+from nlt.bench import run as bench
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.evaluation import clock
-from nlt.evaluation.bench import ceilings
-from nlt.evaluation.bench import run as bench
-from nlt.evaluation.comparison import untrained
+from nlt.evaluation.comparison import build_if_untrained
 from nlt.evaluation.frames import Frames
 from nlt.metrics.quantities import NETWORK_STAGES, STAGES
 from nlt.models.method import Method
@@ -76,7 +76,7 @@ def test_the_warm_up_sees_every_scene(monkeypatch):
     device, seen = torch.device("cpu"), []
     watch = clock.Clock(SimpleNamespace(dataset=Samples(range(4 * 16))), device)
     monkeypatch.setattr(watch, "_frame", lambda method, indices: seen.extend(indices) or {"synthesis": 0.0})
-    watch.race({"": torch.nn.Identity()})
+    watch.time_interleaved({"": torch.nn.Identity()})
     assert {index // 16 for index in seen[: clock.WARM_UP]} == {0, 1, 2, 3}
     assert len(set(seen)) == len(seen) == clock.WARM_UP + clock.FRAMES
 
@@ -90,7 +90,7 @@ def test_a_batch_of_frames(tiny, monkeypatch):
     monkeypatch.setattr(clock, "WARM_UP", 1)
     monkeypatch.setattr(clock, "FRAMES", 3)
     first, second = Recorder(), Recorder()
-    timed = clock.Clock(frames, torch.device("cpu"), batch=2).race({"a": first, "b": second})
+    timed = clock.Clock(frames, torch.device("cpu"), batch=2).time_interleaved({"a": first, "b": second})
     assert [len(timed[name]) for name in ("a", "b")] == [3, 3]
     assert set(timed["a"][0]) == {"gbuffer", "path_tracing", "denoise"}
     assert placed == [0, 1, 0, 1, 2, 0, 2, 0, 1, 2, 1, 2, 0, 1, 0, 1]
@@ -155,7 +155,7 @@ def test_everything_is_there_and_adds_up(made):
         assert row["timed_frames"] == 3
         stages = {stage for stage in STAGES if f"{stage}_s" in row}
         rendered = {"cnn": {"gbuffer"}, "nlt_photons": {"gbuffer", "photons"}, "oidn_1": {"gbuffer", "path_tracing"}}
-        trained = not untrained(method)
+        trained = not build_if_untrained(method)
         assert stages == rendered[method] | (set(NETWORK_STAGES) if trained else {"denoise"})
         for timed in (row, row["plain"]) if trained else (row,):
             assert timed["time_per_frame_s"] == pytest.approx(sum(timed[f"{stage}_s"] for stage in stages))

@@ -30,11 +30,6 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock, compare, comparison, progress
-from nlt.evaluation.drawing import learning_curves
-from nlt.evaluation.drawing.dashboard import write_logs
-from nlt.evaluation.drawing.figures import curves
-from nlt.evaluation.drawing.gallery import Shown, worst_pixels
-from nlt.evaluation.drawing.report import draw
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.paper import published
@@ -46,6 +41,11 @@ from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy
 from nlt.models.unet import UNet
 from nlt.paths import CONFIGS, PROJECT
+from nlt.report import learning_curves
+from nlt.report.dashboard import write_logs
+from nlt.report.draw import draw
+from nlt.report.figures import curves
+from nlt.report.gallery import Shown, worst_pixels
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -716,7 +716,7 @@ def test_sizes(world):
     # The maps in the convolution's layout and their concatenation; inputs and parameters besides.
     inputs = 4 * (pixels * channels + 1) + 2 * 8
     assert size["peak_memory_bytes"] == 4 * size["parameters"] + inputs + 4 * pixels * (channels + channels)
-    assert set(clock.Clock(frames, torch.device("cpu")).size(comparison.untrained("oidn_1"))) == {"parameters"}
+    assert set(clock.Clock(frames, torch.device("cpu")).size(comparison.build_if_untrained("oidn_1"))) == {"parameters"}
 
 
 def test_dashboard(world):
@@ -865,5 +865,5 @@ def test_every_comparison_names_what_there_is(name):
     assert all(Path(file).exists() for method in found.methods for file in found.configs(method))
     if found.table:
         assert {m for m in paths.config_names("model") if published(found.table, m)} <= set(found.methods)
-    trained = [method for method in found.methods if comparison.untrained(method) is None]
+    trained = [method for method in found.methods if comparison.build_if_untrained(method) is None]
     assert len(found.jobs()) == 3 * len(trained) + len(found.methods) - len(trained)

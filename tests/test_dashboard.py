@@ -15,10 +15,10 @@ from made_results import ODD, make_troubled_results
 from torch.utils.tensorboard import SummaryWriter
 
 from nlt.cli import main
-from nlt.evaluation.drawing.dashboard import write_logs
 from nlt.evaluation.results import load
 from nlt.metrics.quantities import QUANTITIES
 from nlt.paths import PROJECT
+from nlt.report.dashboard import write_logs
 
 
 @pytest.fixture(scope="module")

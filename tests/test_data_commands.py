@@ -176,7 +176,7 @@ def test_stats_count_the_chosen_spp(tmp_path, monkeypatch):
 def test_show(dataset, tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from nlt.evaluation.drawing import figures
+    from nlt.report import figures
 
     drawn = []
     monkeypatch.setattr(figures.plt, "close", drawn.append)

@@ -9,9 +9,9 @@ from made_results import make_results
 from scipy import stats
 
 from nlt.errors import UserError
-from nlt.evaluation.drawing.figures import curves, draw_speed_accuracy
 from nlt.evaluation.results import load, write_manifest
 from nlt.paths import PROJECT
+from nlt.report.figures import curves, draw_speed_accuracy
 
 MSE = {"tiny": 0.04, "small": 0.02, "medium": 0.01, "large": 0.01, "paper": 0.01}
 

@@ -23,7 +23,7 @@ from nlt.baselines.feature_projection import FeatureProjection
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.cli import main
 from nlt.errors import UserError
-from nlt.evaluation.comparison import untrained
+from nlt.evaluation.comparison import build_if_untrained
 from nlt.models import losses
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import GBUFFER, RenderingModule
@@ -35,7 +35,7 @@ from nlt.paths import config_names, find_config
 
 pytest_plugins = ["training_fixtures"]
 
-UNTRAINED = [name for name in config_names("model") if untrained(name)]
+UNTRAINED = [name for name in config_names("model") if build_if_untrained(name)]
 CONFIGS = [find_config("model", name) for name in config_names("model") if name not in UNTRAINED]
 SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 
@@ -426,7 +426,7 @@ def test_exported_programs_run_alone(tmp_path, checkpoints):
 @pytest.mark.parametrize("name", UNTRAINED)
 def test_untrained(name):
     """Reads what it declares; its prediction follows the light."""
-    method, batch = untrained(name), {**synthetic_batch(), "traced": 3 * torch.rand(2, 3, 16, 16)}
+    method, batch = build_if_untrained(name), {**synthetic_batch(), "traced": 3 * torch.rand(2, 3, 16, 16)}
     declared = {key: batch[key] for key in (*method.inputs, "exposure", "scene", "index")}
     expected = method(declared)
     assert expected.shape == (2, 3, 16, 16) and expected.isfinite().all() and expected.is_contiguous()
@@ -447,7 +447,7 @@ def test_oidn_removes_noise_and_keeps_edges_of_its_guides(name):
         "traced": albedo * noise, "albedo": albedo, "exposure": torch.tensor([0.5]),
         "normal": torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 64, 64),
     }  # fmt: skip
-    error = (untrained(name)(batch) - albedo).square().mean()
+    error = (build_if_untrained(name)(batch) - albedo).square().mean()
     assert error < (batch["traced"] - albedo).square().mean() / 20
 
 
@@ -456,7 +456,7 @@ def test_oidns_quality():
     batch = {**synthetic_batch(), "traced": 3 * torch.rand(2, 3, 16, 16)}
     images = [OpenImageDenoise(quality=quality)(batch) for quality in ("fast", "balanced", "high")]
     assert min((a - b).abs().max() for a, b in combinations(images, 2)) > 0.01
-    assert torch.equal(untrained("oidn_1")(batch), images[-1])
+    assert torch.equal(build_if_untrained("oidn_1")(batch), images[-1])
     with pytest.raises(UserError, match=r"^model\.init_args\.quality: must be one of fast, balanced, high, is 'best'$"):
         OpenImageDenoise(quality="best")
 

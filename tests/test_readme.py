@@ -21,9 +21,7 @@ from nlt import paths
 from nlt.cli import _LIGHTNING, _parser, main
 from nlt.data import generate as generation
 from nlt.data.spec import load_spec
-from nlt.data.suites import load_suites
-from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.select.ladder import Ladder
+from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.metrics import quantities
 from nlt.paths import PROJECT, find_config
 from nlt.rendering.renderer import Renderer
@@ -32,6 +30,8 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import rooms
 from nlt.scenes.description import load_description
 from nlt.scenes.state import sample_view
+from nlt.select.space import Ladder
+from nlt.stress.suites import load_suites
 from nlt.training import check_configs
 
 pytest_plugins = ["training_fixtures"]
@@ -129,7 +129,7 @@ def parse(command):
         scenes = load_spec(options.config)[0].scenes
     elif name in ("compare", "stress"):
         comparison = Comparison.load(options.config, options.scale, options.data, options.methods)
-        trained = [method for method in comparison.methods if not untrained(method)]
+        trained = [method for method in comparison.methods if not build_if_untrained(method)]
         for method in trained if options.methods else trained[-1:]:
             _taken(tuple(comparison.configs(method)))
         assert name == "compare" or load_suites(options.manifest)

@@ -18,14 +18,14 @@ from matplotlib import colormaps
 from playwright.sync_api import sync_playwright
 
 from nlt.evaluation.claims import write_claims
-from nlt.evaluation.drawing import page as report_page
-from nlt.evaluation.drawing.gallery import Shown, draw_failures
-from nlt.evaluation.drawing.packing import COARSEST, max_error, pack, pack_to_fit
-from nlt.evaluation.drawing.tables import write_tables
 from nlt.evaluation.paper import label, published
 from nlt.evaluation.results import load, write_manifest, write_rows
 from nlt.metrics.display import display
 from nlt.metrics.quantities import QUANTITIES
+from nlt.report import page as report_page
+from nlt.report.gallery import Shown, draw_failures
+from nlt.report.packing import COARSEST, max_error, pack, pack_to_fit
+from nlt.report.tables import write_tables
 
 VIEWS, SIZE, EXPOSURE = 4, 32, 0.8  # of make_results
 GPU, FASTER = "GPU, made up", {m: 4 + k for k, m in enumerate(TROUBLED[:-1])}  # the last is not timed there

@@ -25,9 +25,6 @@ from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, merge
 from nlt.evaluation import clock
-from nlt.evaluation.select import advice, search, trials
-from nlt.evaluation.select.choice import choose, paired_difference, ranked, within
-from nlt.evaluation.select.ladder import Ladder
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
 from nlt.paths import CONFIGS
@@ -35,6 +32,9 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import BUILTINS, mitsuba_scene
 from nlt.scenes.description import EXPERIMENTS, load_description
 from nlt.scenes.pointcloud import sample_points
+from nlt.select import advice, search, trials
+from nlt.select.choice import choose, paired_difference, ranked, within
+from nlt.select.space import SearchSpace
 from nlt.waiting import WAIT_POLICY
 
 pytest_plugins = ["training_fixtures"]
@@ -155,13 +155,13 @@ def test_thin():
     batch = {"photon_flux": torch.rand(2, 100, 3), "photon_origin": kinds.float().view(1, -1, 1).expand(2, -1, 3)}
     batch |= {"photon_hit": torch.rand(2, 100, 3), "point_position": torch.rand(2, 9, 3), "depth": torch.ones(2)}
     module = NeuralLightTransport(photons=True, width=2, num_points=9, max_points=4, max_photons=20)
-    thin = module.thin(batch)
+    thin = module.subsample(batch)
     counts = np.bincount(thin["photon_origin"][0, :, 0].int().numpy())
     assert counts.tolist() == [10, 2, 6, 2]
     rows = [int((batch["photon_hit"][0] == hit).all(1).nonzero()) for hit in thin["photon_hit"][0]]
     assert len(set(rows)) == 20 and torch.equal(thin["photon_flux"], batch["photon_flux"][:, rows] * 5)
     assert torch.equal(thin["point_position"], batch["point_position"][:, :4]) and thin["depth"] is batch["depth"]
-    again = module.thin(thin)
+    again = module.subsample(thin)
     assert all(torch.equal(again[name], thin[name]) for name in thin)
     assert module.num_photons == 20 and module.embedding.table.weight.shape[0] == 4
     assert FeatureProjection(width=2, num_points=3, max_points=4).embedding.table.weight.shape[0] == 3
@@ -269,7 +269,7 @@ class Here:
 
 
 @pytest.fixture
-def ladder(tiny, tmp_path, monkeypatch, one_thread):
+def space(tiny, tmp_path, monkeypatch, one_thread):
     """Its config file; the scene is not looked at again, and the clock is brief."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts()])
@@ -283,7 +283,7 @@ def ladder(tiny, tmp_path, monkeypatch, one_thread):
         "data": str(tiny.data), "scale": str(write(tmp_path / "scale.yaml", scale)), "methods": ["cnn", "nlt_photons"],
         "sizes": sizes, "points": [64], "photons": [32, 64], "minutes": BUDGET_S / 60, "seeds": 2,
     }  # fmt: skip
-    return write(tmp_path / "ladder.yaml", content)
+    return write(tmp_path / "space.yaml", content)
 
 
 def run_select(config, *more, out="out"):
@@ -296,9 +296,9 @@ def table(out, name):
         return list(csv.DictReader(file))
 
 
-def test_end_to_end(ladder, tiny, monkeypatch, capsys):
+def test_end_to_end(space, tiny, monkeypatch, capsys):
     fake = FakeTime(monkeypatch)
-    rows = run_select(ladder)
+    rows = run_select(space)
     assert len(rows) == 6 and {row["candidate"] for row in rows if row["full"] == "1"} == {
         "nlt_photons@b, 64 points, 64 photons"
     }
@@ -344,7 +344,7 @@ def test_end_to_end(ladder, tiny, monkeypatch, capsys):
     assert manifest["rungs"] == [EPOCH, STEPS] and manifest["seeds"] == [0, 1]
     # Said again, nothing is trained again.
     del fake.begun[:]
-    assert [row["candidate"] for row in run_select(ladder) if row["chosen"] == "1"] == [chosen["candidate"]]
+    assert [row["candidate"] for row in run_select(space) if row["chosen"] == "1"] == [chosen["candidate"]]
     assert not fake.begun
     # Killed in the middle of a training and begun again, all is the same.
     (plan,) = Path("runs").rglob("plan.json")
@@ -353,14 +353,14 @@ def test_end_to_end(ladder, tiny, monkeypatch, capsys):
     write(plan.parent.mkdir(parents=True) or plan, content)
     fake.die = 8
     with pytest.raises(Killed):
-        main(["select", "--config", str(ladder), "--out", "killed"])
+        main(["select", "--config", str(space), "--out", "killed"])
     (record,) = {path for path in plan.parent.rglob("*.ckpt") if path.stat().st_mtime == newest(plan.parent)}
     assert f"step={STEPS - EPOCH}" in record.name
-    assert run_select(ladder, out="killed") == rows
+    assert run_select(space, out="killed") == rows
 
 
 @pytest.mark.parametrize("lights", [(), ("lamp",)])
-def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
+def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
     """Where nothing moves, a CNN is among those trained longest, though it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
@@ -374,14 +374,14 @@ def test_advised_methods_go_to_the_end(ladder, monkeypatch, lights):
         for name, laps in race(this, modules, budget).items()
     }
     monkeypatch.setattr(trials.Trials, "score", worse)
-    monkeypatch.setattr(clock.Clock, "race", slower)
-    finals = [row for row in run_select(ladder) if row["steps"] == str(STEPS)]
+    monkeypatch.setattr(clock.Clock, "time_interleaved", slower)
+    finals = [row for row in run_select(space) if row["steps"] == str(STEPS)]
     assert len(finals) == 3 and any(row["full"] == "1" for row in finals)
     assert sum(row["method"] == "cnn" for row in finals) == (0 if lights else 1)
 
 
-def test_frames_are_timed_in_a_process(ladder):
-    read = Ladder.load(str(ladder))
+def test_frames_are_timed_in_a_process(space):
+    read = SearchSpace.load(str(space))
     candidates = read.candidates[:2]
     views = LightTransportDataset(generate(read.spec, read.root), read.spec, "val")
     costs = Process(search.frame_costs, read, views, candidates, 1.0).result()
@@ -395,13 +395,13 @@ def newest(folder):
 
 
 @pytest.mark.parametrize("slower", [1.0, 3.0])
-def test_budget(ladder, monkeypatch, capsys, slower):
+def test_budget(space, monkeypatch, capsys, slower):
     """Fewer candidates for less time; slower trainings exceed it by at most one."""
     fake = FakeTime(monkeypatch)
     budget = 100.0
     measured = search.Search._step_s
     monkeypatch.setattr(search.Search, "_step_s", lambda this, module: measured(this, module) / slower)
-    run_select(ladder, f"--minutes={budget / 60}")
+    run_select(space, f"--minutes={budget / 60}")
     assert "of 6 candidates fit" in capsys.readouterr().out
     longest = fake.setup + STEPS * 3
     assert fake.seconds <= budget + longest and all(begun < budget for *_, begun in fake.begun)
@@ -425,9 +425,9 @@ def test_budget(ladder, monkeypatch, capsys, slower):
         ({"data": None}, "data: must be the name"),
     ],
 )
-def test_mistakes(ladder, tmp_path, monkeypatch, capsys, change, said):
+def test_mistakes(space, tmp_path, monkeypatch, capsys, change, said):
     FakeTime(monkeypatch)
-    config = write(tmp_path / "wrong.yaml", {**yaml.safe_load(ladder.read_text()), **change})
+    config = write(tmp_path / "wrong.yaml", {**yaml.safe_load(space.read_text()), **change})
     assert main(["select", "--config", str(config)]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1 and "Traceback" not in error

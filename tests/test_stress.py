@@ -17,22 +17,22 @@ from safetensors import safe_open
 from synthetic import PHOTONS, POINTS, synthetic_batch
 
 from nlt.cli import main
-from nlt.data.changed_scene import MESHES, ChangedScene
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import merge
-from nlt.data.stage import PLACES, Stage
-from nlt.data.stress import rungs
-from nlt.data.suites import load_suites
 from nlt.errors import UserError
-from nlt.evaluation.drawing.page import write_page
-from nlt.evaluation.drawing.stress_figures import draw_stress
-from nlt.evaluation.drawing.stress_report import breaking_point
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import read_rows, write_manifest, write_rows
-from nlt.evaluation.stress.inputs import BUDGET, FRAME
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
 from nlt.paths import CONFIGS
+from nlt.report.page import write_page
+from nlt.stress.changed_scene import MESHES, ChangedScene
+from nlt.stress.figures import stress_section
+from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.perturber import PLACES, ViewPerturber
+from nlt.stress.rendering import view_sets
+from nlt.stress.suites import load_suites
+from nlt.stress.tables import breaking_point
 
 pytest_plugins = ["training_fixtures"]
 
@@ -49,7 +49,7 @@ def test_the_manifest_names_changes_that_there_are():
 def test_fewer_views_are_another_set(spec, tmp_path):
     """They do not mix with what the manifest's number of views has rendered."""
     whole, fewer = load_suites("suites"), load_suites("suites", views=1)
-    assert {rung.views for rung in rungs(spec, fewer, ["camera"])} == {1} != {whole.views}
+    assert {view_set.views for view_set in view_sets(spec, fewer, ["camera"])} == {1} != {whole.views}
     assert whole.directory(spec, tmp_path) != fewer.directory(spec, tmp_path)
 
 
@@ -77,100 +77,100 @@ def spec():
 
 
 @pytest.fixture(scope="module")
-def stage(spec):
+def perturber(spec):
     render = SampleRenderer(spec, 0)
-    return Stage(render, render.points(), seed=0)
+    return ViewPerturber(render, render.points(), seed=0)
 
 
-def centre_pixel(stage, camera):
+def centre_pixel(perturber, camera):
     """Distance along the axis and cosine to the surface of what is in the image's middle."""
     size = dataclasses.replace(camera, matrix=np.array([[1e3, 0, 0.5], [0, 1e3, 0.5], [0, 0, 1.0]]), width=1, height=1)
-    buffers = stage.render.renderer.gbuffer(size)
+    buffers = perturber.render.renderer.gbuffer(size)
     cosine = abs(buffers["normal"][:, 0, 0] @ camera.rotation[:, 2])
     return float(buffers["depth"][0, 0, 0]), float(cosine)
 
 
 @pytest.mark.parametrize("metres", [1.0, 0.25, 0.05])
-def test_near(stage, metres):
-    depth, _ = centre_pixel(stage, stage.place(1, "near", metres))
+def test_near(perturber, metres):
+    depth, _ = centre_pixel(perturber, perturber.place(1, "near", metres))
     assert depth == pytest.approx(metres, rel=0.03)
 
 
 @pytest.mark.parametrize("degrees", [30, 6])
-def test_grazing(stage, degrees):
-    before = stage.place(1)
-    camera = stage.place(1, "grazing", degrees)
-    depth, cosine = centre_pixel(stage, camera)
+def test_grazing(perturber, degrees):
+    before = perturber.place(1)
+    camera = perturber.place(1, "grazing", degrees)
+    depth, cosine = centre_pixel(perturber, camera)
     assert not np.array_equal(camera.world_to_view, before.world_to_view)
     assert depth == pytest.approx(0.75, rel=0.03)
     assert np.degrees(np.arcsin(cosine)) == pytest.approx(degrees, abs=1)
 
 
-def test_lenses(stage):
-    base = stage.place(0)
-    wide = stage.place(0, "field_of_view", 120)
+def test_lenses(perturber):
+    base = perturber.place(0)
+    wide = perturber.place(0, "field_of_view", 120)
     assert wide.fov == pytest.approx(120, abs=1e-3) and np.array_equal(wide.world_to_view, base.world_to_view)
-    more = stage.place(0, "resolution", 1.5)
+    more = perturber.place(0, "resolution", 1.5)
     assert (more.width, more.height) == (48, 48) and more.fov == pytest.approx(base.fov, abs=1e-3)
-    flat = stage.place(0, "aspect", 4)
+    flat = perturber.place(0, "aspect", 4)
     assert (flat.width, flat.height) == (64, 16) and flat.fov == pytest.approx(base.fov, abs=1e-3)
     # Square pixels, and the axis through the middle.
     assert flat.matrix[0, 0] == flat.matrix[1, 1] and np.allclose(flat.matrix[:2, 2], [32, 8])
 
 
-def test_corner(stage):
-    low, high = stage.render.description.room
-    position = stage.place(0, "corner", 0.5).position
+def test_corner(perturber):
+    low, high = perturber.render.description.room
+    position = perturber.place(0, "corner", 0.5).position
     assert np.allclose(np.minimum(position - low, high - position)[[0, 2]], 0.5, atol=1e-5)
 
 
-def test_turned_from_light(stage):
-    camera = stage.place(0, "turned_from_light", 140)
-    light = stage.scene._centres  # not of the light: it is where the description and the state say
+def test_turned_from_light(perturber):
+    camera = perturber.place(0, "turned_from_light", 140)
+    light = perturber.scene._centres  # not of the light: it is where the description and the state say
     assert "moving_light" in light
-    to_light = stage.render.description.light.centre + stage.scene.state.translation[-1] - camera.position
+    to_light = perturber.render.description.light.centre + perturber.scene.state.translation[-1] - camera.position
     level = [camera.rotation[[0, 2], 2], to_light[[0, 2]]]
     cosine = level[0] @ level[1] / np.prod([np.linalg.norm(v) for v in level])
     assert np.degrees(np.arccos(cosine)) == pytest.approx(140, abs=0.1)
 
 
-def test_states_beyond_training(stage):
-    movables, up = stage.scene.movables, 1
-    stage.place(2, "light_lowered", 0.7)
-    assert stage.scene.state.translation[-1, up] == pytest.approx(movables[-1].box[0, up] - 0.7)
-    stage.place(2, "object_outside", 0.5)
+def test_states_beyond_training(perturber):
+    movables, up = perturber.scene.movables, 1
+    perturber.place(2, "light_lowered", 0.7)
+    assert perturber.scene.state.translation[-1, up] == pytest.approx(movables[-1].box[0, up] - 0.7)
+    perturber.place(2, "object_outside", 0.5)
     outside = [
         max((t - m.box[1]).max(), (m.box[0] - t).max())
-        for m, t, p in zip(movables, stage.scene.state.translation, stage.scene.state.present, strict=True)
+        for m, t, p in zip(movables, perturber.scene.state.translation, perturber.scene.state.present, strict=True)
         if p
     ]
     assert max(outside) == pytest.approx(0.5, abs=1e-5) and sorted(outside)[-2] <= 1e-5
-    stage.place(2, "objects_removed", 1.0)
-    assert stage.scene.state.present.tolist() == [False] * (len(movables) - 1) + [True]
-    stage.place(2, "objects_crowded", 0.95)
-    assert stage.scene.state.present.all()
-    stage.place(2)  # nothing of it stays
-    expected = stage.render.spec.states(0)["test"][2]
-    assert stage.scene.state.key == expected.key
+    perturber.place(2, "objects_removed", 1.0)
+    assert perturber.scene.state.present.tolist() == [False] * (len(movables) - 1) + [True]
+    perturber.place(2, "objects_crowded", 0.95)
+    assert perturber.scene.state.present.all()
+    perturber.place(2)  # nothing of it stays
+    expected = perturber.render.spec.states(0)["test"][2]
+    assert perturber.scene.state.key == expected.key
 
 
-def test_lights_of_the_same_power(stage):
+def test_lights_of_the_same_power(perturber):
     """Photons carry it: as much of a light of any size, 4 times as much of one 4 times as bright, red of a red one."""
 
     def power(change=None, value=1.0):
-        stage.place(3, change, value)
-        photons = stage.render.renderer.photons(2000, 1)
+        perturber.place(3, change, value)
+        photons = perturber.render.renderer.photons(2000, 1)
         side = np.ptp(photons["photon_origin"], 0)[[0, 2]].max()
-        lit = stage.lit_points()["emission"]
-        return photons["photon_flux"].sum(0), side, lit[lit.any(1)].mean(0), stage.lit_points()["position"]
+        lit = perturber.lit_points()["emission"]
+        return photons["photon_flux"].sum(0), side, lit[lit.any(1)].mean(0), perturber.lit_points()["position"]
 
     flux, side, emission, _ = power()
     small, small_side, small_emission, points = power("light_size", 0.5)
     np.testing.assert_allclose(small, flux, rtol=0.02)
     assert small_side == pytest.approx(side / 2, rel=0.02)
     np.testing.assert_allclose(small_emission, 4 * emission, rtol=1e-5)
-    lit = stage.points["object"] == len(stage.scene.movables) - 1
-    assert np.ptp(points[lit], 0)[0] == pytest.approx(np.ptp(stage.points["position"][lit], 0)[0] / 2, rel=1e-4)
+    lit = perturber.points["object"] == len(perturber.scene.movables) - 1
+    assert np.ptp(points[lit], 0)[0] == pytest.approx(np.ptp(perturber.points["position"][lit], 0)[0] / 2, rel=1e-4)
     bright, _, bright_emission, _ = power("light_power", 4)
     np.testing.assert_allclose(bright, 4 * flux, rtol=0.02)
     np.testing.assert_allclose(bright_emission, 4 * emission, rtol=1e-5)
@@ -181,15 +181,15 @@ def test_lights_of_the_same_power(stage):
 
 
 @pytest.mark.parametrize("change", sorted(MESHES))
-def test_points_of_changed_scenes(spec, stage, change):
+def test_points_of_changed_scenes(spec, perturber, change):
     """They lie on the changed meshes, row by row those of training where nothing changed, with what is known there."""
-    scene = ChangedScene(stage.render.description, spec.experiment, change, 0.5, stage.points, seed=0)
-    points = scene.moved_points(stage.points)
-    other = {name for name in points if not np.array_equal(points[name], stage.points[name])}
-    assert other and points.keys() == stage.points.keys()
-    assert all(points[name].shape == stage.points[name].shape for name in points)
-    assert all(points[name].dtype == stage.points[name].dtype for name in points)
-    same = (points["position"] == stage.points["position"]).all(1)
+    scene = ChangedScene(perturber.render.description, spec.experiment, change, 0.5, perturber.points, seed=0)
+    points = scene.moved_points(perturber.points)
+    other = {name for name in points if not np.array_equal(points[name], perturber.points[name])}
+    assert other and points.keys() == perturber.points.keys()
+    assert all(points[name].shape == perturber.points[name].shape for name in points)
+    assert all(points[name].dtype == perturber.points[name].dtype for name in points)
+    same = (points["position"] == perturber.points["position"]).all(1)
     assert same.any()
     if change in ("mesh_replaced", "mesh_thinner", "second_light"):
         assert not same.all()
@@ -278,8 +278,7 @@ def made(tmp_path_factory):
     write_rows(directory / "stress" / "stress.csv", rows)
     record = {"command": "nlt stress", "commit": "c" * 40, "views": 2, "scenes": ["room"], "left_out": ["a thing"]}
     write_manifest(directory / "stress", record | {"manifest": yaml.safe_load(MANIFEST.read_text())})
-    draw_stress(directory / "stress")
-    write_page(results, [])
+    write_page(results, [], sections=[stress_section(directory)])
     return directory
 
 
@@ -413,7 +412,7 @@ def test_again_changes_nothing(stressed, monkeypatch):
     """The second time nothing is rendered, trained or judged, and no byte of what is drawn changes."""
     names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.png")
     before = {name: (stressed.directory / name).read_bytes() for name in names}
-    monkeypatch.setattr("nlt.data.stress.Local", None)
-    monkeypatch.setattr("nlt.evaluation.stress.views.SuiteViews.judge", None)
+    monkeypatch.setattr("nlt.stress.rendering.Local", None)
+    monkeypatch.setattr("nlt.stress.views.SuiteViews.judge", None)
     assert main(stressed.command) == 0
     assert {name: (stressed.directory / name).read_bytes() for name in names} == before

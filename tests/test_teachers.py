@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from conftest import write_room
 
+from nlt.bench.teachers import _SPP, _figures
 from nlt.cli import main
-from nlt.evaluation.teachers import _SPP, _figures
 from nlt.scenes.lanes import is_jit
 
 SIZE, VIEWS, RENDERS = 16, 3, 40

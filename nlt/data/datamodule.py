@@ -10,8 +10,8 @@ import lightning as L
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, collated
-from nlt.data.engines import cores
+from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, identity_collate
+from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath
 from nlt.data.loader import ThreadLoader
 from nlt.data.spec import DatasetSpec
@@ -77,7 +77,7 @@ class LightTransportDataModule(L.LightningDataModule):
         """
         self.passes = state_dict.get("passes", 0)
         points, method = state_dict.get("points"), getattr(self.trainer, "lightning_module", None)
-        if getattr(method, "embeds", False) and points and self.points and points != self.points:
+        if getattr(method, "has_point_embeddings", False) and points and self.points and points != self.points:
             raise UserError(
                 f"{self.directory}: has other points than those that the checkpoint's embeddings are of, as when it is "
                 "rendered with another NLT_VARIANT; give --data.root with the checkpoint's own dataset, or train anew"
@@ -114,7 +114,7 @@ class LightTransportDataModule(L.LightningDataModule):
             from nlt.data.online import OnlineDataset  # which needs Mitsuba
 
             devices = self.trainer.num_devices if self.trainer else 1
-            threads = max(1, cores() // (self.workers * devices))
+            threads = max(1, available_cpus() // (self.workers * devices))
             return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads)
         few = name == "train" and self.train_images
         spec = dataclasses.replace(self.stored, train=few) if few else self.stored
@@ -140,7 +140,7 @@ class LightTransportDataModule(L.LightningDataModule):
             batch_size=self.batch_size,
             sampler=sampler,
             drop_last=training,
-            collate_fn=collated,
+            collate_fn=identity_collate,
             num_workers=self.workers,
             pin_memory=torch.cuda.is_available(),
         )

@@ -100,8 +100,8 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         return {name: tensor[0] for name, tensor in self.__getitems__([index]).items()}
 
     def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
-        """A batch, for `torch.utils.data.DataLoader` with `collated`: every value is copied once, to where it stays."""
-        return as_batch([self._tensors(*self._sample(index), index) for index in indices])
+        """A batch; each value is copied once. A `DataLoader` takes it as it is, with `identity_collate`."""
+        return collate([self._tensors(*self._sample(index), index) for index in indices])
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         """The scene of a sample, and what is stored of it."""
@@ -119,12 +119,12 @@ def place_points(
     return points["position"] + translation[points["object"]], present[points["object"]]
 
 
-def as_batch(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+def collate(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Samples as a batch; halves become float32."""
     return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
 
 
-def collated(batch: Any) -> Any:
+def identity_collate(batch: Any) -> Any:
     """For `DataLoader(collate_fn=...)`: a batch of a `LightTransportDataset` is collated as it is read."""
     return batch
 

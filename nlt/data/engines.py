@@ -58,7 +58,7 @@ def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], p
     if slurm and scheduler != "slurm":
         raise UserError("--slurm: options for --scheduler slurm alone")
     if scheduler == "local":
-        return Local(workers or cores(), preload)
+        return Local(workers or available_cpus(), preload)
     if scheduler in ("slurm", "slurm-local"):
         return Slurm(scheduler, workers or _SLURM_WORKERS, slurm)
     if "://" in scheduler:
@@ -66,7 +66,7 @@ def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], p
     raise UserError(f"--scheduler: must be local, slurm or an address such as tcp://host:8786, is {scheduler!r}")
 
 
-def cores() -> int:
+def available_cpus() -> int:
     """Of this machine that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -78,7 +78,7 @@ class Local:
         self.workers, self._preload = workers, preload
 
     def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
-        waiting, threads = list(jobs), max(1, cores() // self.workers)
+        waiting, threads = list(jobs), max(1, available_cpus() // self.workers)
         running: dict[Process, Any] = {}
         counters: dict[Any, Any] = {}
         tried = set()
@@ -195,7 +195,7 @@ def _on_dask(content: bytes, preload: tuple[str, ...]) -> str | None:
     from distributed import get_worker
 
     _allow_children()
-    threads = max(1, cores() // get_worker().state.nthreads)
+    threads = max(1, available_cpus() // get_worker().state.nthreads)
     try:
         Process(_work, content, threads, _counter(), preload=preload).result()
     except UserError as error:
@@ -210,7 +210,7 @@ def _allow_children() -> None:
 
 def _on_slurm(work: Work, job: Any) -> str | None:
     try:
-        work(job, cores(), lambda _: None)
+        work(job, available_cpus(), lambda _: None)
     except UserError as error:
         return str(error)
     return None

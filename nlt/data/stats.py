@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nlt.data.engines import Died, Process, cores
+from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB
 from nlt.data.render import SampleRenderer
@@ -26,7 +26,7 @@ STAGES = {
     "state, view": ("camera_matrix", "world_to_view", "translation", "present"),
     "noisy": ("noisy",),
     "noisy_input": ("noisy_input",),
-    "G-buffer": ("depth", "normal", "albedo"),
+    "G-buffer": ("depth", "normal", "albedo", "emission"),
     "photons": ("photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid"),
     "reference": ("reference_a", "reference_b"),
     "storing": (),
@@ -49,7 +49,7 @@ def stats(place: str, workers: int | None = None) -> str:
     spp = [reference["spp"] for reference in references(open_path(place), spec)]
     full = read_configs([str(CONFIGS / "scale" / "paper.yaml")])["data"]["dataset"]
     paper = DatasetSpec(spec.scenes, spec.experiment, **full)
-    workers = workers or cores()
+    workers = workers or available_cpus()
     with tqdm(desc="measuring", total=2 * len(spec.scenes), unit="scene") as bar:
         ours = _measure(spec, spp, workers, bar)
         theirs = _measure(paper, [paper.reference_spp] * len(spp), workers, bar)
@@ -96,7 +96,9 @@ def _measure(spec: DatasetSpec, spp: list[int], workers: int, bar: tqdm) -> dict
     for scene in range(len(spec.scenes)):
         few = replace(spec, train=_WARM_UP + _SAMPLES, val=0, test=0, reference_spp=spp[scene])
         try:
-            runs = [Process(_time, few, scene, max(1, cores() // workers), time.time()) for _ in range(workers)]
+            runs = [
+                Process(_time, few, scene, max(1, available_cpus() // workers), time.time()) for _ in range(workers)
+            ]
             results += [run.result() for run in runs]
         except Died as error:
             raise UserError(f"the renderer died while it was tried out ({error})") from None

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 from tqdm import tqdm
 
-from nlt.data.engines import cores
+from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.sample import POINT_FIELDS, SPLITS, Field
 from nlt.data.spec import DatasetSpec, Shard
@@ -43,7 +43,7 @@ def verify(place: str) -> None:
     tasks: list[Shard | int] = [k for k in range(len(spec.scenes)) if points_name(k) in there]
     tasks += [shard for shard in spec.shards() if shard.name in there]
     states: dict[tuple[int, str], set[bytes]] = {}
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(available_cpus()) as pool:
         check = lambda task: _check_shard(directory, spec, task)
         for task, file in zip(tasks, tqdm(pool.map(check, tasks), "verifying", len(tasks), unit="file"), strict=True):
             findings += file.findings

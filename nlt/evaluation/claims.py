@@ -25,7 +25,7 @@ BELOW_FLOOR = "the difference is smaller than the reference's own error"
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Inequality:
     """One inequality of a claim: `margin` is positive where it is as claimed, in the metric's unit.
 
     `low` and `high`: 95% interval of the margin over test images and, where there are several, over seeds.
@@ -50,10 +50,10 @@ class Claim:
     where: str
     says: str
     verdict: Verdict
-    comparisons: list[Comparison]
+    comparisons: list[Inequality]
 
     @property
-    def weakest(self) -> Comparison:
+    def weakest(self) -> Inequality:
         """The comparison that decides the verdict: the one of its kind that is furthest from what is claimed."""
         deciding = [c for c in self.comparisons if c.verdict == self.verdict]
         scale = lambda c: abs(c.high - c.low) or 1.0
@@ -90,7 +90,7 @@ def _judge(results: Results, claim: dict[str, Any]) -> Claim:
     return Claim(claim["id"], claim["where"], claim["says"], verdict, found)
 
 
-def _compare(results: Results, metric: str, method: str, other: str, by: float, within: float | None) -> Comparison:
+def _compare(results: Results, metric: str, method: str, other: str, by: float, within: float | None) -> Inequality:
     sign = 1 if QUANTITIES[metric].direction == "lower" else -1
     if within is None:
         margin, error = difference(results, metric, other, method, 1 - sign * by)
@@ -106,7 +106,7 @@ def _compare(results: Results, metric: str, method: str, other: str, by: float, 
     else:
         verdict = "holds" if low > 0 else "does not hold" if high < 0 else "undecided"
     below = results.is_below_floor(metric, results.mean(method, metric) - results.mean(other, metric))
-    return Comparison(metric, method, other, margin, low, high, verdict, below)
+    return Inequality(metric, method, other, margin, low, high, verdict, below)
 
 
 def difference(results: Results, metric: str, a: str, b: str, factor: float = 1.0) -> tuple[float, float]:

@@ -45,9 +45,11 @@ class Clock:
 
     def time(self, method: Method) -> dict[str, Any]:
         """Seconds by stage and of the frame, as `summary` says; warm-up 10 frames, then 40 timed ones."""
-        return summary(self.race({"": method})[""])
+        return summary(self.time_interleaved({"": method})[""])
 
-    def race(self, methods: Mapping[str, Method], seconds: float = math.inf) -> dict[str, list[dict[str, float]]]:
+    def time_interleaved(
+        self, methods: Mapping[str, Method], seconds: float = math.inf
+    ) -> dict[str, list[dict[str, float]]]:
         """Seconds by stage of every timed frame, by method; the device is synchronised around every stage.
 
         The methods take turns at each frame, so that whatever else the machine does slows all. Warm-up 10 frames, then
@@ -73,7 +75,7 @@ class Clock:
         return timed
 
     def _frame(self, method: Method, indices: Sequence[int]) -> dict[str, float]:
-        batch, spec = method.thin(self._batch(indices)), self.dataset.spec
+        batch, spec = method.subsample(self._batch(indices)), self.dataset.spec
         seconds: dict[str, float] = {}
         mask = method.mask(batch, spec.resolution, spec.resolution)
         traced = []
@@ -149,7 +151,7 @@ class Clock:
         """A batch with what the method reads and no more."""
         whole = self._batch([k % len(self.dataset) for k in range(self.batch)])
         batch = {name: value for name, value in whole.items() if name in (*method.fields, "exposure", "scene")}
-        return method.thin(batch | {"index": torch.zeros_like(batch["scene"])})
+        return method.subsample(batch | {"index": torch.zeros_like(batch["scene"])})
 
 
 def summary(laps: list[dict[str, float]]) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""`nlt compare`: generate, train, evaluate and time all methods; write the results, from which the rest is drawn."""
+"""`nlt compare`: generate, train, evaluate and time all methods, and write the results that tables are made from."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,9 @@ from nlt.data.generate import generate
 from nlt.data.spec import load_spec, read_configs
 from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
+from nlt.evaluation import live
 from nlt.evaluation.clock import Clock
-from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.drawing.report import draw
-from nlt.evaluation.drawing.tables import live_floor, live_header, live_row, write_tables
+from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin, surroundings
@@ -31,7 +30,6 @@ from nlt.evaluation.results import (
     RUNS,
     TRAINING_IMAGES,
     VIEWS,
-    load,
     write_images,
     write_manifest,
     write_rows,
@@ -53,6 +51,7 @@ def compare(
     scheduler: str = "local",
     slurm: Mapping[str, str] | None = None,
     train_images: Sequence[int] = (),
+    after_row: Callable[[Path], None] = lambda directory: None,
 ) -> Path:
     """Everything that a table needs, of which what is there already is kept. Returns its directory.
 
@@ -60,6 +59,7 @@ def compare(
         workers: trainings side by side (default: on this machine in turn).
         scheduler, slurm: as `nlt.data.engines.find_engine`, for generation and trainings; the rest is done here.
         train_images: train every method on the first so many images of each scene, too.
+        after_row: called with the directory each time a row has been written.
     """
     start, begun = time.time(), origin()
     directory = Path(out or Path("results") / comparison.name)
@@ -76,7 +76,7 @@ def compare(
         (*job, count): Training.of(comparison, *job, Path("runs") / dataset.name, count)
         for count in (None, *sorted({*train_images} - {spec.train}))
         for job in jobs
-        if not untrained(job[0])
+        if not build_if_untrained(job[0])
     }
     died = train(list(trainings.values()), scheduler, workers, slurm or {})
     if history := _history(trainings.values()):
@@ -98,12 +98,12 @@ def compare(
     for number, (method, seed) in enumerate(jobs, 1):
         print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed}
-        with _noted(run):
-            module, took, place = untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
+        with _record_failure(run):
+            module, took, place = build_if_untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
             if module is None:
                 training = trainings[method, seed, None]
                 (module, took), place = _trained(training, died, device), training.run
-            of = _decides(record, method, took)
+            of = _evaluation_cache_key(record, method, took)
             metrics, each, radiance = test.evaluate_once(module, place / JUDGED, of)
             run |= clock.time(module) | metrics | clock.size(module) | took
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
@@ -113,22 +113,22 @@ def compare(
                 write_images(directory, method, radiance=radiance)
         runs.append(run)
         if number == 1:
-            print(live_header())
-        print(live_row(run), flush=True)
+            print(live.header())
+        print(live.row(run), flush=True)
         write_rows(directory / RUNS, runs)
         write_timings(directory, record, runs)
         write_rows(directory / VIEWS, views)
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
-        write_tables(load(directory))
-    print("\n" + "\n".join([live_header(), *(live_row(run) for run in runs), live_floor(record["floor"])]))
+        after_row(directory)
+    print("\n" + "\n".join([live.header(), *(live.row(run) for run in runs), live.floor(record["floor"])]))
     # What the table's own trainings saw is a point of the curve, too.
-    images = [{**run, "train_images": spec.train} for run in runs if train_images and not untrained(run["method"])]
+    images = [
+        {**run, "train_images": spec.train} for run in runs if train_images and not build_if_untrained(run["method"])
+    ]
     rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in images]
     rows += [_on_fewer(training, died, test, record) for training in trainings.values() if training.train_images]
     if rows:
         write_rows(directory / TRAINING_IMAGES, rows)
-    draw(directory)
-    print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     return directory
 
 
@@ -161,14 +161,16 @@ def _on_fewer(
 ) -> dict[str, Any]:
     """A row of training_images.csv, of a training on some of the images."""
     row: dict[str, Any] = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
-    with _noted(row):
+    with _record_failure(row):
         module, took = _trained(training, died, test.device)
-        row |= test.evaluate_once(module, training.run / JUDGED, _decides(record, training.method, took))[0]
+        row |= test.evaluate_once(module, training.run / JUDGED, _evaluation_cache_key(record, training.method, took))[
+            0
+        ]
     print(f"{training.name}: {row['status']} {row['message']}", flush=True)
     return row
 
 
-def _decides(record: Mapping[str, Any], method: str, took: Mapping[str, Any]) -> dict[str, Any] | None:
+def _evaluation_cache_key(record: Mapping[str, Any], method: str, took: Mapping[str, Any]) -> dict[str, Any] | None:
     """What decides how a method is judged; None by code that has no name."""
     if not record["commit"] or record["uncommitted_changes"]:
         return None
@@ -177,7 +179,7 @@ def _decides(record: Mapping[str, Any], method: str, took: Mapping[str, Any]) ->
 
 
 @contextmanager
-def _noted(row: dict[str, Any]) -> Iterator[None]:
+def _record_failure(row: dict[str, Any]) -> Iterator[None]:
     """Whatever goes wrong is noted in the row, and the others go on; but for a user's mistake, a full disk."""
     row |= {"status": OK, "message": ""}
     try:

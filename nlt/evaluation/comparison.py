@@ -91,7 +91,7 @@ class Comparison:
 
     def jobs(self) -> list[tuple[str, int]]:
         """The rows to make: a method and a seed each; what is not trained has one seed."""
-        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if untrained(m) else self.seeds)]
+        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if build_if_untrained(m) else self.seeds)]
 
     def configs(self, method: str) -> list[str]:
         """The config files of a method's training, in order."""
@@ -100,7 +100,7 @@ class Comparison:
         return [str(path) for path in (self.data, find_config("model", name), self.scale, *filter(None, variants))]
 
 
-def untrained(method: str) -> Method | None:
+def build_if_untrained(method: str) -> Method | None:
     """The method, if its class is one that needs no training; None for one that does."""
     file = find_config("model", method.partition("@")[0])
     model = read_configs([str(file)]).get("model", {})

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
-from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError
 from nlt.evaluation.frames import Frames
@@ -76,7 +76,7 @@ class Evaluation:
         metrics = ImageMetrics(perceptual=True).to(self.device)
         dataset = LightTransportDataset(self.directory, self.spec, "test", ())
         mse: list[float] = []
-        for batch in DataLoader(dataset, batch_size=_BATCH, collate_fn=collated):
+        for batch in DataLoader(dataset, batch_size=_BATCH, collate_fn=identity_collate):
             a, b, exposure = (batch[name].to(self.device) for name in ("reference_a", "reference_b", "exposure"))
             mse += metrics.update(a, b, b, exposure)["mse"].tolist()
         values = {name: float(value) for name, value in metrics.compute().items() if name not in OF_HALVES}
@@ -96,7 +96,7 @@ class Evaluation:
         dataset = LightTransportDataset(self.directory, self.spec, "test", method.fields)
         shown, rows = [], []
         pools: list[tuple[Tensor, Tensor]] = []
-        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH, collate_fn=collated)):
+        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH, collate_fn=identity_collate)):
             indices = cpu_batch["index"].tolist()
             if "traced" in method.fields and method.spp:
                 cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])

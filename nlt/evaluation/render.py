@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import SampleTensors, as_batch
+from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
@@ -89,7 +89,7 @@ class ModelRenderer:
         view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
         tensors = self._tensors(self.scene, self._state | view)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
-        batch = {name: value.to(self.device) for name, value in as_batch([tensors]).items()}
+        batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
         return batch | {"noisy_input": self._few_pixels(batch, camera)} if few else batch
 
     def _few_pixels(self, batch: Batch, camera: Camera) -> Tensor:
@@ -106,7 +106,7 @@ class ModelRenderer:
 
     def frame(self, state: SceneState, camera: Camera) -> Tensor:
         """Radiance (1, 3, H, W)."""
-        return self.moving(self.method.thin(self.batch(state, camera)))
+        return self.moving(self.method.subsample(self.batch(state, camera)))
 
     def traced(self, state: SceneState, camera: Camera, spp: int, frame: int) -> Tensor:
         """Path-traced radiance (1, 3, H, W)."""
@@ -169,7 +169,7 @@ def render(
         device = default_device()
         policy = Policy.for_device(device)
         model = ModelRenderer(method, spec, index, device)
-        if method.embeds and points and points_crc(model.points) != points[index]:
+        if method.has_point_embeddings and points and points_crc(model.points) != points[index]:
             raise UserError(
                 f"CKPT: {checkpoint}: has embeddings of other points than there are here, as with another NLT_VARIANT; "
                 f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
@@ -200,7 +200,7 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     """The dataset's spec with the scene, and which it is."""
     files = [find_config("scenes", name).resolve() for name in spec.scenes]
     file = find_config("scenes", scene).resolve()
-    if method.embeds:
+    if method.has_point_embeddings:
         points = min(spec.points, method.hparams["max_points"] or spec.points)
         if (method.hparams["num_scenes"], method.hparams["num_points"]) != (len(files), points):
             raise UserError(
@@ -210,7 +210,7 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     if file in files:
         return spec, files.index(file)
     load_description(scene)
-    if method.embeds:
+    if method.has_point_embeddings:
         raise UserError(
             f"SCENE: {scene}: {checkpoint} has embeddings of the points of {', '.join(spec.scenes)} alone; "
             "name one of these, or train on this scene"

@@ -18,8 +18,8 @@ import yaml
 from nlt.data.engines import find_engine
 from nlt.data.files import write_bytes
 from nlt.data.spec import merge, read_configs
-from nlt.errors import DivergedError, UserError, as_mistake
-from nlt.evaluation.comparison import Comparison, untrained
+from nlt.errors import DivergedError, UserError, to_user_error
+from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
 from nlt.evaluation.provenance import origin
 from nlt.models.module import RenderingModule
@@ -91,7 +91,7 @@ class Training:
 def check(comparison: Comparison) -> None:
     """Raises UserError if a config of any method would not do, before the first is trained."""
     for method in comparison.methods:
-        if not untrained(method):
+        if not build_if_untrained(method):
             check_configs(comparison.configs(method))
 
 
@@ -143,7 +143,7 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
         except UserError:
             raise
         except OSError as error:
-            raise as_mistake(error) from None
+            raise to_user_error(error) from None
         except Exception as error:
             progress.died(error)
             raise
@@ -176,7 +176,7 @@ def _fit(training: Training, progress: Progress) -> dict[str, Any]:
 
 
 def _run_config(training: Training) -> dict[str, Any]:
-    # Hyperparameters are logged when the metrics are known: nlt/evaluation/drawing/dashboard.py.
+    # Hyperparameters are logged when the metrics are known: nlt/report/dashboard.py.
     logger = {"save_dir": str(training.run), "name": "", "version": "", "default_hp_metric": False}
     trainer = read_configs(list(training.files)).get("trainer") or {}
     return {

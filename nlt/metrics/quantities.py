@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -74,3 +75,20 @@ COSTS: dict[str, Quantity] = {
     "images_seen": Quantity("images seen", "lower", ",.0f"),
 }
 QUANTITIES: dict[str, Quantity] = METRICS | COSTS
+_NONE = "–"
+
+
+def text(key: str, value: float | None) -> str:
+    """A value as text, in its quantity's unit."""
+    if value is None or not math.isfinite(value):
+        return _NONE
+    quantity = QUANTITIES[key]
+    return format(value * quantity.scale, quantity.format)
+
+
+def heading(key: str) -> str:
+    """The heading of a column: the quantity's name, its unit, and an arrow towards a metric's better values."""
+    quantity = QUANTITIES[key]
+    unit = f" ({quantity.unit})" if quantity.unit != "1" else ""
+    arrow = {"lower": " ↓", "higher": " ↑"}[quantity.direction] if key in METRICS else ""
+    return f"{quantity.label}{unit}{arrow}"

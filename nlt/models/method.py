@@ -50,7 +50,7 @@ class Method(nn.Module):
         """Photons of the stage "photons"; None for as many as the dataset has."""
         return None
 
-    def thin(self, batch: Batch) -> Batch:
+    def subsample(self, batch: Batch) -> Batch:
         """What the method takes of a batch: all of it, unless overridden."""
         return batch
 

@@ -212,7 +212,7 @@ class RenderingModule(Method, L.LightningModule):
         return radiance + batch["emission"] if self.hparams["add_emission"] else radiance
 
     @property
-    def embeds(self) -> bool:
+    def has_point_embeddings(self) -> bool:
         """Whether something is learned of each point, which holds for these scenes' points alone."""
         return any(isinstance(part, PointEmbedding) for part in self.modules())
 
@@ -220,7 +220,7 @@ class RenderingModule(Method, L.LightningModule):
     def num_photons(self) -> int | None:
         return self.hparams["max_photons"]
 
-    def thin(self, batch: Batch) -> Batch:
+    def subsample(self, batch: Batch) -> Batch:
         """The batch with `max_points` points and `max_photons` photons at most; the photons' flux sums to the same."""
         points, photons = self.hparams["max_points"], self.hparams["max_photons"]
         if points:  # in the order in which they were drawn: any of them are a uniform sample
@@ -234,8 +234,8 @@ class RenderingModule(Method, L.LightningModule):
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         """Transport, projection, synthesis."""
-        transport = lambda batch, _: self.transport(self.thin(batch))
-        features = lambda batch, transported: self.features(self.thin(batch), transported)
+        transport = lambda batch, _: self.transport(self.subsample(batch))
+        features = lambda batch, transported: self.features(self.subsample(batch), transported)
         return {"transport": transport, "projection": features, "synthesis": self.synthesize}
 
     # --- training and evaluation ---

@@ -12,16 +12,16 @@ import lightning as L
 import torch
 import yaml
 
-from nlt.data.engines import cores
+from nlt.data.engines import available_cpus
 from nlt.data.files import write_bytes
 from nlt.data.spec import merge, read_configs
 from nlt.errors import DivergedError, UserError
-from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.drawing.stress_report import STRESS, TRAININGS
+from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
+from nlt.stress.tables import STRESS, TRAININGS
 
 SEED, RATE, PRECISION, CORRUPTED = "seed", "learning rate", "precision", "corrupted samples"
 
@@ -72,7 +72,7 @@ def train_suite(
             training = Training.of(_Varied(**own, over=file), method, seed, runs / STRESS)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
     # Networks this small leave a second core idle; an accelerator is one's own.
-    died = train([training for _, training in jobs], "local", cores() if device.type == "cpu" else 1, {})
+    died = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
     rows = []
     for row, training in jobs:
         row |= {"status": FAILED if training in died else OK, "message": died.get(training, "")}
@@ -95,7 +95,7 @@ def _one_of_a_kind(comparison: Comparison) -> list[str]:
     """The first trained method of each class and set of inputs."""
     found: dict[str, str] = {}
     for method in comparison.methods:
-        if not untrained(method):
+        if not build_if_untrained(method):
             model = read_configs([comparison.configs(method)[1]])["model"]
             kind = {
                 k: v for k, v in model.get("init_args", {}).items() if not isinstance(v, int) or isinstance(v, bool)

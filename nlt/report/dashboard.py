@@ -19,10 +19,10 @@ from tensorboard.plugins.hparams import summary_v2 as hp  # api imports TensorFl
 from torch.utils.tensorboard import SummaryWriter
 
 from nlt.errors import UserError
-from nlt.evaluation.drawing.tables import COLUMNS, heading
+from nlt.evaluation.live import COLUMNS
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import OK, Results, load
-from nlt.metrics.quantities import METRICS
+from nlt.metrics.quantities import METRICS, heading
 
 LOGS = "tensorboard"
 # What beside method and seed is a hyperparameter: its name, and where it stands in a method's config.

@@ -2,7 +2,7 @@
 
 results/NAME/stress/ holds `stress.csv`, a row per method, suite, ladder, severity and view; `manifest.json`, with the
 manifest of the suites in it; and, outside git, `images/SUITE-METHOD.npz`, the radiance of a suite's highest
-severities. Everything else there is made from these: nlt/evaluation/drawing/stress_report.py.
+severities. Everything else there is made from these: nlt/stress/tables.py.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nlt.data.changed_scene import MESHES
 from nlt.data.generate import generate
 from nlt.data.spec import DatasetSpec, load_spec
-from nlt.data.stage import PLACES, lacks
-from nlt.data.stress import render_suites
-from nlt.data.suites import CLEAN, COMPUTED, FLICKER, SUITES, TRAINING, Suites, load_suites
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.claims import write_claims
-from nlt.evaluation.comparison import Comparison, untrained
-from nlt.evaluation.drawing.page import write_page
-from nlt.evaluation.drawing.stress_figures import draw_stress
-from nlt.evaluation.drawing.stress_report import ROWS, STRESS, TRAININGS
+from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
-from nlt.evaluation.stress.inputs import BUDGET, FRAME
-from nlt.evaluation.stress.trainings import train_suite
-from nlt.evaluation.stress.views import SuiteViews
 from nlt.evaluation.trainings import Training, check, train
 from nlt.models.policy import Policy, default_device
+from nlt.report.page import write_page
+from nlt.stress.changed_scene import MESHES
+from nlt.stress.figures import stress_section
+from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.perturber import PLACES, lacks
+from nlt.stress.rendering import render_suites
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, SUITES, TRAINING, Suites, load_suites
+from nlt.stress.tables import ROWS, STRESS, TRAININGS
+from nlt.stress.trainings import train_suite
+from nlt.stress.views import SuiteViews
 
 
 def stress(
@@ -63,7 +63,9 @@ def stress(
     _check_changes(content)
     dataset = generate(spec, root)
     runs, seed = Path("runs") / dataset.name, comparison.seeds[0]
-    trainings = {name: Training.of(comparison, name, seed, runs) for name in comparison.methods if not untrained(name)}
+    trainings = {
+        name: Training.of(comparison, name, seed, runs) for name in comparison.methods if not build_if_untrained(name)
+    }
     died = train(list(trainings.values()), "local", None, {})
     rendered = render_suites(spec, dataset, content, wanted, root)
     device = default_device()
@@ -83,7 +85,7 @@ def stress(
     bar = tqdm(total=len(comparison.methods) * len(judged), unit="suite", file=sys.stderr, mininterval=1.0)
     for name in comparison.methods:
         bar.set_description(f"judging {name}")
-        method, took = untrained(name), dict[str, Any]()
+        method, took = build_if_untrained(name), dict[str, Any]()
         try:
             if method is None and trainings[name] in died:
                 raise DivergedError(died[trainings[name]])
@@ -120,10 +122,10 @@ def stress(
         train_suite(directory, comparison, content.content[TRAINING], runs, error, device)
     if _measured(directory) != before:  # else the manifest is of the run that measured it
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
-    draw_stress(directory)
-    if (directory.parent / RUNS).exists():  # of `nlt compare`: its report shows this, too
+    section = stress_section(directory.parent)
+    if (directory.parent / RUNS).exists():  # the results of `nlt compare`, whose report shows the section, too
         results = load(directory.parent)
-        write_page(results, write_claims(results))
+        write_page(results, write_claims(results), sections=[section])
     print(f"written to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     if broken := sum(row["nonfinite"] for row in rows):
         raise UserError(f"{directory / ROWS}: nonfinite: {broken:.0f} pixels are not finite; see the rows above zero")

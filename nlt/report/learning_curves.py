@@ -7,11 +7,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from nlt.evaluation.drawing.figures import COLOURS, DASHES, MARKERS, curves, plt, save
-from nlt.evaluation.drawing.tables import heading
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import HISTORY, OK, TRAINING_IMAGES, Results
-from nlt.metrics.quantities import METRICS
+from nlt.metrics.quantities import METRICS, heading
+from nlt.report.figures import COLOURS, DASHES, MARKERS, curves, plt, save
 
 _PANELS = ("mse", "mssim", "fid", "feature_l1", "flip")
 _MOST = 4  # panels side by side

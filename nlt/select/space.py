@@ -1,4 +1,4 @@
-"""What a config of configs/select asks for: a ladder of models, from the leanest to the full one."""
+"""What a config of configs/select asks for: a space of models, from the leanest to the full one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _KEYS = ("data", "scale", "methods", "sizes", "points", "photons", "minutes", "s
 
 @dataclass(frozen=True)
 class Candidate:
-    """A rung of the ladder; `points` and `photons` are None where the method reads none."""
+    """A round of the space; `points` and `photons` are None where the method reads none."""
 
     method: str
     size: str
@@ -41,7 +41,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class SearchSpace:
     """The candidates: every method in every size, with every number of points and of photons that it reads.
 
     `methods` and `sizes` are in the config's order, `points` and `photons` ascend: the last ones make the full model.
@@ -58,7 +58,7 @@ class Ladder:
     seeds: int
 
     @classmethod
-    def load(cls, config: str, minutes: float | None = None) -> Ladder:
+    def load(cls, config: str, minutes: float | None = None) -> SearchSpace:
         """Read a config by name or path; `minutes` overrides its own.
 
         Raises:
@@ -82,7 +82,7 @@ class Ladder:
             raise UserError(f"{file}: minutes: must be a number above 0, is {content['minutes']!r}")
         if type(content["seeds"]) is not int or content["seeds"] < 1:
             raise UserError(f"{file}: seeds: must be a whole number of at least 1, is {content['seeds']!r}")
-        ladder = cls(
+        space = cls(
             file.stem,
             find_config("data", content["data"]),
             find_config("scale", content["scale"]),
@@ -93,8 +93,8 @@ class Ladder:
             content["minutes"],
             content["seeds"],
         )
-        ladder._check(file)
-        return ladder
+        space._check(file)
+        return space
 
     def _check(self, file: Path) -> None:
         for key in ("points", "photons"):

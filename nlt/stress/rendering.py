@@ -15,19 +15,19 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.changed_scene import MESHES, ChangedScene
-from nlt.data.dataset import SampleTensors, as_batch
-from nlt.data.engines import Local, cores
+from nlt.data.dataset import SampleTensors, collate
+from nlt.data.engines import Local, available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
-from nlt.data.stage import Stage, lacks, path
 from nlt.data.store import Points, ShardReader, points_name, read_points, write_shard
-from nlt.data.suites import CLEAN, FLICKER, PATHS, RENDERED, Suites
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 from nlt.scenes.camera import Camera
 from nlt.scenes.pointcloud import sample_points
+from nlt.stress.changed_scene import MESHES, ChangedScene
+from nlt.stress.perturber import ViewPerturber, lacks, path
+from nlt.stress.suites import CLEAN, FLICKER, PATHS, RENDERED, Suites
 
 DRAWS, PATH = "draws", "path"
 FEWER_SPP = (1, 2, 3)  # per input pixel, of the clean views
@@ -35,7 +35,7 @@ _DRAWN = ("noisy_input", "photon_origin", "photon_direction", "photon_flux", "ph
 
 
 @dataclass(frozen=True)
-class Rung:
+class ViewSet:
     """A file of views: one ladder of a suite at one severity, in one scene."""
 
     scene: int
@@ -59,25 +59,25 @@ class Rung:
         return [self.scene, zlib.crc32(f"{self.suite}/{self.ladder}".encode()), self.severity]
 
 
-def rungs(spec: DatasetSpec, suites: Suites, wanted: list[str]) -> list[Rung]:
+def view_sets(spec: DatasetSpec, suites: Suites, wanted: list[str]) -> list[ViewSet]:
     """Everything to render for the suites `wanted`; the clean views come with any of them."""
     flicker, found = suites.content[FLICKER], []
     views = min(suites.views, spec.test)
     for scene in range(len(spec.scenes)):
-        found.append(Rung(scene, CLEAN, "views", 0, views=views))
+        found.append(ViewSet(scene, CLEAN, "views", 0, views=views))
         for ladder in suites.ladders:
             if ladder.suite in RENDERED and ladder.suite in wanted and not lacks(spec, scene, ladder.change):
                 found += [
-                    Rung(scene, ladder.suite, ladder.name, severity, ladder.change, value, views)
+                    ViewSet(scene, ladder.suite, ladder.name, severity, ladder.change, value, views)
                     for severity, value in enumerate(ladder.values, 1)
                 ]
         if FLICKER in wanted:
-            found += [Rung(scene, FLICKER, DRAWS, k + 1, views=views) for k in range(flicker["draws"])]
+            found += [ViewSet(scene, FLICKER, DRAWS, k + 1, views=views) for k in range(flicker["draws"])]
             for kind in PATHS:
                 if not (kind == "object" and lacks(spec, scene, "object_outside")) and not (
                     kind == "light" and lacks(spec, scene, "light_lowered")
                 ):
-                    found.append(Rung(scene, FLICKER, kind, 0, PATH, flicker[kind], flicker["frames"]))
+                    found.append(ViewSet(scene, FLICKER, kind, 0, PATH, flicker[kind], flicker["frames"]))
     return found
 
 
@@ -91,15 +91,15 @@ def render_suites(
     """
     directory = suites.directory(spec, root)
     there = list_files(directory) if directory.exists() else set()
-    missing = [rung for rung in rungs(spec, suites, wanted) if rung.name not in there]
+    missing = [view_set for view_set in view_sets(spec, suites, wanted) if view_set.name not in there]
     if not missing:
         return directory
-    total, died = sum(rung.views for rung in missing), dict[tuple[Rung, ...], str]()
-    print(f"{directory}: {total} views of {len(missing)} rungs to render", flush=True)
+    total, died = sum(view_set.views for view_set in missing), dict[tuple[ViewSet, ...], str]()
+    print(f"{directory}: {total} views of {len(missing)} sets to render", flush=True)
     work = partial(_render, spec, suites, str(dataset), str(directory), choose_variant().name)
     with (
         tqdm(total=total, unit="view", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(Local(cores(), preload=(SampleTensors.__module__,)).run(work, _jobs(missing), died)) as ticks,
+        closing(Local(available_cpus(), preload=(SampleTensors.__module__,)).run(work, _jobs(missing), died)) as ticks,
     ):
         for ticked in ticks:
             bar.update((ticked or 0) - bar.n)
@@ -108,17 +108,19 @@ def render_suites(
     return directory
 
 
-def _jobs(missing: list[Rung]) -> list[tuple[Rung, ...]]:
-    """Rungs that one process renders: loading a scene costs as much as a few views.
+def _jobs(missing: list[ViewSet]) -> list[tuple[ViewSet, ...]]:
+    """View sets that one process renders: loading a scene costs as much as a few views.
 
     A scene that is changed has a process of its own, for Mitsuba cannot forget the one before.
     """
-    changed = [(rung,) for rung in missing if rung.change in MESHES]
-    plain: dict[int, list[Rung]] = {}
-    for rung in missing:
-        if rung.change not in MESHES:
-            plain.setdefault(rung.scene, []).append(rung)
-    shared = [tuple(mine[k :: cores()]) for mine in plain.values() for k in range(min(cores(), len(mine)))]
+    changed = [(view_set,) for view_set in missing if view_set.change in MESHES]
+    plain: dict[int, list[ViewSet]] = {}
+    for view_set in missing:
+        if view_set.change not in MESHES:
+            plain.setdefault(view_set.scene, []).append(view_set)
+    shared = [
+        tuple(mine[k :: available_cpus()]) for mine in plain.values() for k in range(min(available_cpus(), len(mine)))
+    ]
     return [*shared, *changed]
 
 
@@ -128,7 +130,7 @@ def _render(
     dataset: str,
     place: str,
     variant: str,
-    job: tuple[Rung, ...],
+    job: tuple[ViewSet, ...],
     threads: int,
     tick: Callable[[int], None],
 ) -> None:
@@ -142,30 +144,32 @@ def _render(
         render = SampleRenderer(spec, first.scene, threads, build)
     else:
         render = SampleRenderer(spec, first.scene, threads)
-    stage = Stage(render, points, seed)
-    for rung in job:
-        seeds = np.random.SeedSequence([seed, *rung.seed]).spawn(rung.views)
+    perturber = ViewPerturber(render, points, seed)
+    for view_set in job:
+        seeds = np.random.SeedSequence([seed, *view_set.seed]).spawn(view_set.views)
         samples = []
-        for sample in _samples(stage, suites, rung, seeds):
+        for sample in _samples(perturber, suites, view_set, seeds):
             samples.append(sample)
             tick(1)
-        write_shard(directory / rung.points_name, [_points(stage, points, rung)])
-        write_shard(directory / rung.name, samples)
+        write_shard(directory / view_set.points_name, [_points(perturber, points, view_set)])
+        write_shard(directory / view_set.name, samples)
 
 
-def _samples(stage: Stage, suites: Suites, rung: Rung, seeds: list[np.random.SeedSequence]) -> Iterator[Points]:
-    """A rung's views, with everything that a method may read and what methods without training are given."""
-    render = stage.render
-    if rung.ladder == DRAWS:
+def _samples(
+    perturber: ViewPerturber, suites: Suites, view_set: ViewSet, seeds: list[np.random.SeedSequence]
+) -> Iterator[Points]:
+    """The views of a set, with everything that a method may read and what methods without training are given."""
+    render = perturber.render
+    if view_set.ladder == DRAWS:
         for k, one in enumerate(seeds):
-            yield render.view(stage.place(k), one, _DRAWN)
+            yield render.view(perturber.place(k), one, _DRAWN)
         return
-    change = None if rung.change in MESHES else rung.change
-    cameras: Iterator[Camera] = (stage.place(k, change, rung.value) for k in range(rung.views))
+    change = None if view_set.change in MESHES else view_set.change
+    cameras: Iterator[Camera] = (perturber.place(k, change, view_set.value) for k in range(view_set.views))
     if change == PATH:
-        cameras = path(stage, rung.ladder, rung.value, rung.views)
+        cameras = path(perturber, view_set.ladder, view_set.value, view_set.views)
     spp = {f"traced_{count}": count for count in suites.content["traced"]}
-    if rung.suite == CLEAN:
+    if view_set.suite == CLEAN:
         spp |= {f"input_{count}": count for count in FEWER_SPP}
     for camera, one in zip(cameras, seeds, strict=True):
         sample = render.view(camera, one, render.spec.fields("test"))
@@ -174,29 +178,33 @@ def _samples(stage: Stage, suites: Suites, rung: Rung, seeds: list[np.random.See
         yield sample
 
 
-def _points(stage: Stage, points: Points, rung: Rung) -> Points:
-    """The point cloud of a rung: training's, as the changed scene has it, or another draw."""
-    if rung.ladder != DRAWS:
-        return stage.scene.moved_points(points) if isinstance(stage.scene, ChangedScene) else stage.lit_points()
-    spec = stage.render.spec
-    return sample_points(stage.scene, spec.points, spec.seed + rung.severity)
+def _points(perturber: ViewPerturber, points: Points, view_set: ViewSet) -> Points:
+    """The point cloud of a set: training's, as the changed scene has it, or another draw."""
+    if view_set.ladder != DRAWS:
+        return (
+            perturber.scene.moved_points(points)
+            if isinstance(perturber.scene, ChangedScene)
+            else perturber.lit_points()
+        )
+    spec = perturber.render.spec
+    return sample_points(perturber.scene, spec.points, spec.seed + view_set.severity)
 
 
 def read_views(
-    directory: AnyPath, spec: DatasetSpec, suites: Suites, rung: Rung, points: Points | None = None
+    directory: AnyPath, spec: DatasetSpec, suites: Suites, view_set: ViewSet, points: Points | None = None
 ) -> dict[str, Tensor]:
-    """The views of a rung as a batch, with "traced_N" and, of the clean ones, "input_N"; with other points, if given.
+    """The views of a set as a batch, with "traced_N" and, of the clean ones, "input_N"; with other points, if given.
 
     Of a draw, only what differs from the clean views.
     """
     names = list(_DRAWN)
-    if rung.ladder != DRAWS:
+    if view_set.ladder != DRAWS:
         names = [*spec.fields("test"), *(f"traced_{count}" for count in suites.content["traced"])]
-    if rung.suite == CLEAN:
+    if view_set.suite == CLEAN:
         names += [f"input_{count}" for count in FEWER_SPP]
     reader = ShardReader()
-    stored = [reader.read(directory / rung.name, k, names) for k in range(rung.views)]
-    if rung.ladder == DRAWS:
-        return as_batch([{name: torch.from_numpy(array) for name, array in view.items()} for view in stored])
-    tensors = SampleTensors(spec, {rung.scene: points or read_points(directory / rung.points_name)})
-    return as_batch([tensors(rung.scene, view, k) for k, view in enumerate(stored)])
+    stored = [reader.read(directory / view_set.name, k, names) for k in range(view_set.views)]
+    if view_set.ladder == DRAWS:
+        return collate([{name: torch.from_numpy(array) for name, array in view.items()} for view in stored])
+    tensors = SampleTensors(spec, {view_set.scene: points or read_points(directory / view_set.points_name)})
+    return collate([tensors(view_set.scene, view, k) for k, view in enumerate(stored)])

@@ -277,7 +277,7 @@ function drawStages() {
   $("stages").innerHTML = `<span class="key" role="presentation">${stages.map((stage) => `<span><i style="background:${colour(stage)}"></i>${stage.replace("_", " ")}</span>`).join("")}</span>${rows.join("")}`;
 }
 
-// ---- packed images: the inverse of nlt/evaluation/drawing/packing.py ----
+// ---- packed images: the inverse of nlt/report/packing.py ----
 
 const half = new Float32Array(0x7c00); // of the half's bits, times 16
 for (let bits = 0; bits < half.length; bits++) {

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from nlt.bench.bare import Bare
 from nlt.data.render import SampleRenderer
-from nlt.evaluation.bench.bare import Bare
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _ENOUGH = 0.05  # seconds of a call, above which overheads do not count

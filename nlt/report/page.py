@@ -20,29 +20,18 @@ import yaml
 from PIL import Image
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.claims import BELOW_FLOOR, Claim, Comparison
+from nlt.evaluation.claims import BELOW_FLOOR, Claim, Inequality
 from nlt.evaluation.claims import text as claim_text
-from nlt.evaluation.drawing.figures import bar, curves
-from nlt.evaluation.drawing.gallery import FAILURES, Shown, failures
-from nlt.evaluation.drawing.packing import max_error, pack_to_fit
-from nlt.evaluation.drawing.stress_report import (
-    BREAKING,
-    ROWS,
-    STRESS,
-    TEXT,
-    TRAININGS,
-    introduction,
-    load_stress,
-    paragraphs,
-)
-from nlt.evaluation.drawing.stress_report import tables as stress_tables
-from nlt.evaluation.drawing.tables import Table, heading, tables, text
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
-from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
+from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
+from nlt.report.figures import bar, curves
+from nlt.report.gallery import FAILURES, Shown, failures
+from nlt.report.packing import max_error, pack_to_fit
+from nlt.report.tables import Table, tables
 
 PAGE = "report.html"
-_PARTS = Path(__file__).parent / "page"
+_PARTS = Path(__file__).parent / "page_parts"
 _MEGABYTES = 25  # of the file, at most
 _OTHER = 500_000  # of these, for what describes the images and the methods
 _AXES = ("time_per_frame_s", "flops", "parameters", "peak_memory_bytes")
@@ -52,19 +41,37 @@ _FILES = (
     *("table.csv", "table.md", "table.tex", "runs.csv", "timings.csv", "views.csv"),
     *("failures.csv", "failures.md", "failures.tex", "claims.md", "claims.json", "manifest.json"),
 )
-_STRESS_FILES = (ROWS, BREAKING, TRAININGS, TEXT, "manifest.json")
 _WEBP = 90  # quality of pixel figures, which lie beside the report as they are
 
 
-def write_page(results: Results, claims: list[Claim], megabytes: float | None = None) -> None:
-    """Write report.html from the stored results, what they say of the claims, and the figures beside them.
+@dataclass(frozen=True)
+class Section:
+    """A section of report.html that another feature writes; `None` in its place leaves it out.
+
+    `paragraphs` are Markdown; `directory` holds the section's figures and `files`; `source` says which files its
+    tables come from.
+    """
+
+    name: str
+    title: str
+    paragraphs: list[str]
+    tables: list[Table]
+    directory: Path
+    files: tuple[str, ...]
+    source: str
+
+
+def write_page(
+    results: Results, claims: list[Claim], megabytes: float | None = None, sections: Iterable[Section | None] = ()
+) -> None:
+    """Write report.html from the stored results, the verdicts on the claims, and the figures in the same directory.
 
     Images are as many and as precise as `megabytes` (10^6 bytes; default: 25) of the file leave room for; of one view
     at least.
     """
     megabytes = megabytes or _MEGABYTES
     manifest = results.manifest
-    title = str(manifest.get("comparison", "Comparison"))
+    title = str(manifest.get("comparison", "Inequality"))
     if manifest["table"]:
         title += f": {paper()[manifest['table']]['title']}"
     parts = {
@@ -77,7 +84,7 @@ def write_page(results: Results, claims: list[Claim], megabytes: float | None = 
         "failures": _failures(results),
         "files": _files(results.directory, _FILES),
         "figures": _figures(results.directory),
-        "stress": _stress(results.directory / STRESS),
+        "sections": "\n".join(_section(section) for section in sections if section),
         "provenance": _provenance(results),
     }
     packed, data = _images(results, int(megabytes * 1e6) - sum(map(len, parts.values())) - _OTHER)
@@ -330,18 +337,16 @@ def _failures(results: Results) -> str:
     return _titled(table, _grid("failures", table.title, table, origins))
 
 
-def _stress(directory: Path) -> str:
-    """The section on what the stress suites say; nothing where they were not tried."""
-    stressed = load_stress(directory)
-    if stressed is None:
-        return ""
-    parts = ['<section id="stress" aria-labelledby="stress-title">', '<h2 id="stress-title">Where methods fail</h2>']
-    parts += [f"<p>{_marked_up(text)}</p>" for text in (introduction(stressed), *paragraphs(stressed))]
-    for number, table in enumerate(stress_tables(stressed)):
-        origins = _Origins(f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}", [""] * len(table.columns))
-        parts.append(_titled(table, _grid(f"stress-{number}", table.title, table, origins)))
-    files = f'<p class="note">As files: {_files(directory, _STRESS_FILES)}.</p>'
-    return "\n".join([*parts, _figures(directory), files, "</section>"])
+def _section(section: Section) -> str:
+    """A section of another feature as HTML."""
+    heading = f'<h2 id="{section.name}-title">{escape(section.title)}</h2>'
+    parts = [f'<section id="{section.name}" aria-labelledby="{section.name}-title">', heading]
+    parts += [f"<p>{_marked_up(text)}</p>" for text in section.paragraphs]
+    for number, table in enumerate(section.tables):
+        origins = _Origins(section.source, [""] * len(table.columns))
+        parts.append(_titled(table, _grid(f"{section.name}-{number}", table.title, table, origins)))
+    files = f'<p class="note">As files: {_files(section.directory, section.files)}.</p>'
+    return "\n".join([*parts, _figures(section.directory), files, "</section>"])
 
 
 def _marked_up(text: str) -> str:
@@ -409,12 +414,12 @@ def _claims(results: Results, claims: list[Claim]) -> str:
     )
 
 
-def _verdict(comparison: Comparison) -> str:
+def _verdict(comparison: Inequality) -> str:
     below = f"; {BELOW_FLOOR}" if comparison.below_floor else ""
     return f"{_MARKS[comparison.verdict]} {comparison.verdict}{below}"
 
 
-def _margin(comparison: Comparison) -> str:
+def _margin(comparison: Inequality) -> str:
     if not math.isfinite(comparison.margin):
         return "–"
     return f"{comparison.margin:+.3g} [{comparison.low:+.3g}, {comparison.high:+.3g}]"

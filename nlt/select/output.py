@@ -9,10 +9,9 @@ from typing import Any
 
 import matplotlib
 
-from nlt.evaluation.drawing.figures import COLOURS, HALO, MARKERS, pareto_front, save
-from nlt.evaluation.drawing.tables import heading, text
 from nlt.evaluation.paper import label
-from nlt.metrics.quantities import QUANTITIES
+from nlt.metrics.quantities import QUANTITIES, heading, text
+from nlt.report.figures import COLOURS, HALO, MARKERS, pareto_front, save
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

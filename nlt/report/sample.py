@@ -10,7 +10,7 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import open_path
 from nlt.data.store import read_spec
 from nlt.errors import UserError
-from nlt.evaluation.drawing.figures import draw_sample
+from nlt.report.figures import draw_sample
 
 
 def show_sample(place: str, split: str, index: int, output: Path) -> Path:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.drawing.figures import COLOURS, MARKERS, plt, save
 from nlt.evaluation.paper import label
 from nlt.metrics.quantities import STAGES
+from nlt.report.figures import COLOURS, MARKERS, plt, save
 
 BENCH = "bench.json"
 _COLOUR = dict(zip(STAGES, (*COLOURS[:6], "#999999"), strict=True))

@@ -15,16 +15,16 @@ from torch import Tensor
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, read_points
-from nlt.data.stress import DRAWS, Rung, read_views, rungs
-from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
 from nlt.errors import UserError
-from nlt.evaluation.stress.inputs import BUDGET, FRAME
 from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy
 from nlt.models.transport import PointEmbedding
+from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.rendering import DRAWS, ViewSet, read_views, view_sets
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
 
 
 class SuiteViews:
@@ -40,19 +40,19 @@ class SuiteViews:
         policy: Policy,
     ) -> None:
         self.directory, self.spec, self.suites, self.device, self.policy = directory, spec, suites, device, policy
-        self.rungs = rungs(spec, suites, wanted)
+        self.view_sets = view_sets(spec, suites, wanted)
         self.batches = cache(self._batches)
 
     def _batches(self, suite: str) -> dict[tuple[str, int], list[Batch]]:
         """Of each ladder and severity of a rendered suite: a batch per scene."""
         found: dict[tuple[str, int], list[Batch]] = {}
-        for rung in self.rungs:
-            if rung.suite == suite:
-                found.setdefault((rung.ladder, rung.severity), []).append(self._batch(rung))
+        for view_set in self.view_sets:
+            if view_set.suite == suite:
+                found.setdefault((view_set.ladder, view_set.severity), []).append(self._batch(view_set))
         return found
 
-    def _batch(self, rung: Rung) -> Batch:
-        batch = read_views(self.directory, self.spec, self.suites, rung)
+    def _batch(self, view_set: ViewSet) -> Batch:
+        batch = read_views(self.directory, self.spec, self.suites, view_set)
         return {name: value.to(self.device) for name, value in batch.items()}
 
     def references(self, suite: str) -> dict[str, np.ndarray]:
@@ -154,25 +154,25 @@ class SuiteViews:
         return rows
 
     def _draws(self, method: Method, scene: int, clean: Batch, kind: str) -> Iterator[Tensor]:
-        for rung in self.rungs:
-            if rung.suite != FLICKER or rung.ladder != DRAWS or rung.scene != scene:
+        for view_set in self.view_sets:
+            if view_set.suite != FLICKER or view_set.ladder != DRAWS or view_set.scene != scene:
                 continue
             if kind == "points":
-                yield self._with_points(method, rung, clean)
+                yield self._with_points(method, view_set, clean)
                 continue
             prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
-            drawn = self.batches(FLICKER)[DRAWS, rung.severity][scene]
+            drawn = self.batches(FLICKER)[DRAWS, view_set.severity][scene]
             yield self.predict(method, clean | {name: v for name, v in drawn.items() if name.startswith(prefix)})
 
-    def _with_points(self, method: Method, rung: Rung, clean: Batch) -> Tensor:
+    def _with_points(self, method: Method, view_set: ViewSet, clean: Batch) -> Tensor:
         """With another draw of the points; each has what is learned of training's nearest point of its object."""
-        drawn = read_points(self.directory / rung.points_name)
-        base = next(r for r in self.rungs if r.suite == CLEAN and r.scene == rung.scene)
+        drawn = read_points(self.directory / view_set.points_name)
+        base = next(r for r in self.view_sets if r.suite == CLEAN and r.scene == view_set.scene)
         points = read_points(self.directory / base.points_name)
         moved = read_views(self.directory, self.spec, self.suites, base, drawn)
         fields = {name: value.to(self.device) for name, value in moved.items() if name.startswith("point_")}
         batch = clean | fields
-        with _embeddings_of(method, rung.scene, points, drawn):
+        with _embeddings_of(method, view_set.scene, points, drawn):
             return self.predict(method, batch)
 
 

@@ -1,26 +1,24 @@
-"""The comparison's tables, from results on disk: as CSV, Markdown and LaTeX, and live in the terminal."""
+"""The tables of a comparison, made from results on disk: as CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from nlt.data.files import write_bytes
+from nlt.evaluation.live import COLUMNS, FLOOR
 from nlt.evaluation.paper import label, paper, published
 from nlt.evaluation.results import OK, Results, write_rows
-from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES
+from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 
-# The first table's columns, the paper's and in its order; then what the paper lacks.
-COLUMNS = tuple(paper()["columns"])
+# Metrics that the paper lacks.
 _FEATURE_LAYERS = tuple(key for key in METRICS if key.startswith("feature_l1_"))
 _MORE = ("unbiased_mse", "psnr", "flip", "kid", *_FEATURE_LAYERS)
 _SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
-_NONE = "–"
-_FLOOR = "reference (its halves)"
 
 
 @dataclass(frozen=True)
@@ -34,22 +32,6 @@ class Table:
     # Of each column: its quantity, and the results that it is from. Empty for a table that is not of quantities.
     sources: list[tuple[str, Results]] = field(default_factory=list)
     first: str = "method"
-
-
-def text(key: str, value: float | None) -> str:
-    """A number as it is printed, in its quantity's unit."""
-    if value is None or not math.isfinite(value):
-        return _NONE
-    quantity = QUANTITIES[key]
-    return format(value * quantity.scale, quantity.format)
-
-
-def heading(key: str) -> str:
-    """A column's heading: name, unit, and for a metric the direction in which it is better."""
-    quantity = QUANTITIES[key]
-    unit = f" ({quantity.unit})" if quantity.unit != "1" else ""
-    arrow = {"lower": " ↓", "higher": " ↑"}[quantity.direction] if key in METRICS else ""
-    return f"{quantity.label}{unit}{arrow}"
 
 
 def tables(results: Results) -> list[Table]:
@@ -126,7 +108,7 @@ def _table(
         cells = [cell(of, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key, of in sources]
         rows.append([_name(results, method), *cells])
     if cell is _cell and any(key in results.floor for key, _ in sources):
-        rows.append([_FLOOR, *(text(key, results.floor.get(key)) for key, _ in sources)])
+        rows.append([FLOOR, *(text(key, results.floor.get(key)) for key, _ in sources)])
     return Table(title, note, [heading(key) for key, _ in sources], rows, sources)
 
 
@@ -135,7 +117,7 @@ def write_tables(results: Results) -> None:
     found = tables(results)
     rows = [_summary(results, method) for method in results.methods]
     if results.floor:
-        rows.append({"method": _FLOOR, "status": OK, "n_test": results.manifest["n_test"], **results.floor})
+        rows.append({"method": FLOOR, "status": OK, "n_test": results.manifest["n_test"], **results.floor})
     write_rows(results.directory / "table.csv", rows)
     write_texts(results, "table", found)
 
@@ -197,20 +179,3 @@ def _latex(found: list[Table]) -> str:
             r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
         ]  # fmt: skip
     return "\n".join(lines)
-
-
-def live_header() -> str:
-    """Headings for `live_row`."""
-    return f"{'method':22}" + "".join(f"{heading(key):>18}" for key in COLUMNS)
-
-
-def live_floor(floor: Mapping[str, float]) -> str:
-    """The reference's halves against each other, for the terminal."""
-    return f"{_FLOOR:22}" + "".join(f"{text(key, floor.get(key)):>18}" for key in COLUMNS)
-
-
-def live_row(run: dict[str, Any]) -> str:
-    """One run, for the terminal."""
-    if run["status"] != OK:
-        return f"{label(run['method']):22} {run['status']}: {run['message']}"
-    return f"{label(run['method']):22}" + "".join(f"{text(key, run.get(key)):>18}" for key in COLUMNS)

@@ -15,13 +15,13 @@ from nlt.data.files import write_bytes
 from nlt.data.generate import generate
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
-from nlt.evaluation.select import advice
-from nlt.evaluation.select.choice import choose, paired_difference
-from nlt.evaluation.select.ladder import Candidate, Ladder
-from nlt.evaluation.select.report import draw_front, markdown
-from nlt.evaluation.select.search import Search
-from nlt.evaluation.select.trials import SCORES, as_error
 from nlt.metrics.quantities import COSTS
+from nlt.select import advice
+from nlt.select.choice import choose, paired_difference
+from nlt.select.output import draw_front, markdown
+from nlt.select.search import Search
+from nlt.select.space import Candidate, SearchSpace
+from nlt.select.trials import SCORES, as_error
 from nlt.waiting import wait_passively
 
 Row = dict[str, Any]
@@ -30,77 +30,77 @@ CHOSEN, FULL, BEST, FEWEST = "chosen", "full model", "best", "by parameters"
 
 
 def select(config: str, minutes: float | None = None, out: str | None = None, only_advice: bool = False) -> Path | None:
-    """Say what varies in a dataset's scenes, then search the ladder; write the results to a directory.
+    """Say what varies in a dataset's scenes, then search the space; write the results to a directory.
 
     Raises:
         UserError: the config is wrong, or the minutes are too few.
     """
     start, begun = time.time(), origin()
     wait_passively()  # where frames are timed; this process, which trains, has loaded torch and goes on spinning
-    ladder = Ladder.load(config, minutes)
-    facts = advice.measure_facts(ladder.spec)
-    advised = advice.advise(ladder.spec, facts)
+    space = SearchSpace.load(config, minutes)
+    facts = advice.measure_facts(space.spec)
+    advised = advice.advise(space.spec, facts)
     for each in advised:
         print(f"{each.subject}: {each.verdict}\n    {each.reason}", flush=True)
     if only_advice:
         return None
-    directory = Path(out or Path("results/select") / ladder.name)
+    directory = Path(out or Path("results/select") / space.name)
     write_bytes(directory / "advice.md", advice.table(advised, facts).encode())
-    dataset = generate(ladder.spec, ladder.root)
+    dataset = generate(space.spec, space.root)
     methods = [method for each in advised for method in each.methods]
-    search = Search(ladder, dataset, Path("runs") / dataset.name / "select", methods)
+    search = Search(space, dataset, Path("runs") / dataset.name / "select", methods)
     finals = search.run()
     times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
     parameters = {c: float(search.entries[c].cost["parameters"]) for c in finals}
     errors = [search.errors(finals, key) for key in SCORES]
     best = min(finals, key=lambda c: errors[0][c].mean())
-    picks = {CHOSEN: choose(errors, times), FULL: ladder.full, BEST: best, FEWEST: choose(errors, parameters)}
-    if ladder.full not in finals:
+    picks = {CHOSEN: choose(errors, times), FULL: space.full, BEST: best, FEWEST: choose(errors, parameters)}
+    if space.full not in finals:
         print("the full model was not trained as long as the last: nothing is compared with it", flush=True)
         del picks[FULL]
     confirmed = _confirm(search, picks)
     rows = _rows(search, finals, picks[CHOSEN])
-    write_bytes(directory / "chosen.yaml", _chosen(ladder, picks[CHOSEN]).encode())
+    write_bytes(directory / "chosen.yaml", _chosen(space, picks[CHOSEN]).encode())
     write_rows(directory / "table.csv", rows)
     write_rows(directory / "confirmed.csv", confirmed)
     write_rows(directory / "views.csv", _views(search, finals))
     record = {
         **begun,
         **surroundings(search.device, search.policy),
-        "select": ladder.name,
-        **{key: getattr(ladder, key) for key in ("methods", "sizes", "points", "photons", "minutes")},
+        "select": space.name,
+        **{key: getattr(space, key) for key in ("methods", "sizes", "points", "photons", "minutes")},
         "seeds": search.seeds,
-        "rungs": search.rungs,
+        "rungs": search.rounds,
         "budget_spent_min": round(search.spent / 60, 2),
         "dataset": dataset.name,
-        "n_val": ladder.spec.val * len(ladder.spec.scenes),
-        "n_test": ladder.spec.test * len(ladder.spec.scenes),
+        "n_val": space.spec.val * len(space.spec.scenes),
+        "n_test": space.spec.test * len(space.spec.scenes),
         "facts": [asdict(fact) for fact in facts],
         "advice": [asdict(each) for each in advised],
-        "configs": {c.name: ladder.config(c) for c in finals},
+        "configs": {c.name: space.config(c) for c in finals},
         "wall_time_s": round(time.time() - start, 1),
     }
     write_manifest(directory, record)
-    text = markdown(ladder.name, rows, confirmed, record)
+    text = markdown(space.name, rows, confirmed, record)
     write_bytes(directory / "table.md", text.encode())
     draw_front(directory, rows)
     print(f"\n{text}\nwritten to {directory}; go on with: nlt fit --config {directory}/chosen.yaml", flush=True)
     return directory
 
 
-def _chosen(ladder: Ladder, candidate: Candidate) -> str:
-    head = f"# {candidate.name}: chosen by `nlt select --config {ladder.name}`, ready for `nlt fit --config`.\n"
-    return head + yaml.safe_dump(ladder.config(candidate), sort_keys=False)
+def _chosen(space: SearchSpace, candidate: Candidate) -> str:
+    head = f"# {candidate.name}: chosen by `nlt select --config {space.name}`, ready for `nlt fit --config`.\n"
+    return head + yaml.safe_dump(space.config(candidate), sort_keys=False)
 
 
 def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Row]:
-    """A row per candidate of the ladder; scores are of the validation split, differences from the best's paired."""
+    """A row per candidate of the space; scores are of the validation split, differences from the best's paired."""
     errors = {key: search.errors(finals, key) for key in SCORES}
     best = {key: min(each, key={c: e.mean() for c, e in each.items()}.__getitem__) for key, each in errors.items()}
     rows = []
-    for candidate in search.ladder.candidates:
+    for candidate in search.space.candidates:
         row: Row = {"candidate": candidate.name, **asdict(candidate), "chosen": int(candidate == chosen)}
-        row |= {"full": int(candidate == search.ladder.full), "status": "did not fit"}
+        row |= {"full": int(candidate == search.space.full), "status": "did not fit"}
         if entry := search.entries.get(candidate):
             seeds = search.seeds if candidate in finals else [0]
             row |= {"status": entry.status, "steps": entry.steps, "seeds": len(seeds)}

@@ -1,4 +1,4 @@
-"""The trainings of a ladder's candidates: each goes on from its checkpoint, and is scored; what was found is kept."""
+"""The trainings of a space's candidates: each goes on from its checkpoint, and is scored; what was found is kept."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import yaml
 from torch.utils.data import DataLoader
 
 from nlt import training
-from nlt.data.dataset import LightTransportDataset, collated
+from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.data.spec import merge
 from nlt.errors import DivergedError
-from nlt.evaluation.select.ladder import Candidate, Ladder
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy
+from nlt.select.space import Candidate, SearchSpace
 from nlt.training import newest_checkpoint, read_checkpoint
 
 SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
@@ -35,13 +35,13 @@ Scores = dict[str, list[float]]  # of every image, by the keys of SCORES
 class Trials:
     """Trainings in `directory`, a directory each by candidate and seed."""
 
-    def __init__(self, ladder: Ladder, dataset: Any, directory: Path, device: torch.device, policy: Policy) -> None:
-        self.ladder, self.dataset, self.directory = ladder, dataset, directory
+    def __init__(self, space: SearchSpace, dataset: Any, directory: Path, device: torch.device, policy: Policy) -> None:
+        self.space, self.dataset, self.directory = space, dataset, directory
         self.device, self.policy = device, policy
 
     def split(self, name: str, inputs: tuple[str, ...] | None = None) -> LightTransportDataset:
         """A split of the dataset."""
-        return LightTransportDataset(self.dataset, self.ladder.spec, name, inputs)
+        return LightTransportDataset(self.dataset, self.space.spec, name, inputs)
 
     def train(self, candidate: Candidate, seed: int, steps: int, begun: int, step_s: float) -> dict[str, Any]:
         """Train on from `begun` to `steps` and score on the validation split, or what is known of it.
@@ -79,7 +79,7 @@ class Trials:
             },
         }  # fmt: skip
         file = run / "run.yaml"
-        write_bytes(file, yaml.safe_dump(merge(self.ladder.config(candidate), own)).encode())
+        write_bytes(file, yaml.safe_dump(merge(self.space.config(candidate), own)).encode())
         arguments, before = ["fit", f"--config={file}"], 0
         if checkpoint := newest_checkpoint(run):
             before = read_checkpoint(checkpoint)["global_step"]
@@ -99,7 +99,7 @@ class Trials:
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
         metrics, found = ImageMetrics(perceptual=False).to(self.device), []
-        for cpu_batch in DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=collated):
+        for cpu_batch in DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=identity_collate):
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
             with self.policy.applied(self.device):
                 prediction = module(batch)

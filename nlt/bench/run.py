@@ -21,6 +21,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from nlt.bench import ceilings
+from nlt.bench.bare import Bare
+from nlt.bench.output import BENCH, write_report
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
@@ -30,11 +33,8 @@ from nlt.data.spec import DatasetSpec, load_spec, read_configs
 from nlt.data.stats import laps, timed_spp
 from nlt.data.store import missing_files, write_manifest, write_shard
 from nlt.errors import UserError
-from nlt.evaluation.bench import ceilings
-from nlt.evaluation.bench.bare import Bare
-from nlt.evaluation.bench.report import BENCH, write_report
 from nlt.evaluation.clock import LEAST_FRAMES, Clock, summary
-from nlt.evaluation.comparison import untrained
+from nlt.evaluation.comparison import build_if_untrained
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.paper import order
 from nlt.evaluation.provenance import origin, surroundings
@@ -191,7 +191,7 @@ class _Bench:
 
     def parts(self) -> list[Part]:
         """All that is to be measured, in order: growth from small to large."""
-        trained = [name for name in self.methods if not untrained(name)]
+        trained = [name for name in self.methods if not build_if_untrained(name)]
         parts = [Part("ceilings"), Part("generation"), Part("loading")]
         parts += [Part("frame", name) for name in self.methods] + [Part("training", name) for name in trained]
         for name in self.growth:
@@ -259,7 +259,7 @@ class _Bench:
 
     def method(self, name: str, settings: Mapping[str, int]) -> Method:
         """A method with random weights, or the checkpoint's."""
-        if method := untrained(name):
+        if method := build_if_untrained(name):
             return method
         if self.checkpoint:
             return self._loaded(name)
@@ -311,9 +311,9 @@ class _Bench:
         clock = Clock(self.frames(self.settings, self._count()), self.device, self.settings["batch"])
         method = self.method(name, self.settings)
         if not isinstance(method, RenderingModule):
-            timed = clock.race({"": method}, self.seconds)[""]
+            timed = clock.time_interleaved({"": method}, self.seconds)[""]
             return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
-        timed, slow = clock.race({"": method, "plain": plain(method)}, 2 * self.seconds).values()
+        timed, slow = clock.time_interleaved({"": method, "plain": plain(method)}, 2 * self.seconds).values()
         network = [[_network(frame) for frame in path] for path in (slow, timed)]
         ratios = [s / t for s, t in zip(*network, strict=True)]
         speedup = dict(zip(("p5", "median", "p95"), np.percentile(ratios, (5, 50, 95)).tolist(), strict=True))
@@ -350,7 +350,7 @@ class _Bench:
         count = LEAST_FRAMES if part.factor in _DATASET and settings != self.settings else self._count()
         clock = Clock(self.frames(settings, count), self.device, settings["batch"])
         method = self.method(part.method, settings)
-        timed = clock.race({"": method}, self.seconds)[""]
+        timed = clock.time_interleaved({"": method}, self.seconds)[""]
         return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
 
     def _training(self, name: str, frame: Mapping[str, Any]) -> dict[str, Any]:

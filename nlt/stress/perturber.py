@@ -24,7 +24,7 @@ _NEAR_FROM, _GRAZING_AT = 1.0, 0.75  # metres: points are looked for beyond; gra
 _TRIES = 200
 
 
-class Stage:
+class ViewPerturber:
     """The test views of a scene, as they are or changed: `place` one, then render it."""
 
     def __init__(self, render: SampleRenderer, points: Points, seed: int) -> None:
@@ -134,90 +134,92 @@ class Stage:
         return (self._description.camera if room is None else room).mean(0)
 
 
-def _light_lowered(stage: Stage, metres: float) -> None:
+def _light_lowered(perturber: ViewPerturber, metres: float) -> None:
     """Under the bottom of its box."""
-    state, light, up = stage.scene.state, len(stage.objects) - 1, stage._description.up
-    box = stage.scene.movables[light].box
+    state, light, up = perturber.scene.state, len(perturber.objects) - 1, perturber._description.up
+    box = perturber.scene.movables[light].box
     moved = state.translation.astype(float)
     moved[light] += up * (box[0] @ up - moved[light] @ up - metres)
-    stage.move(moved, state.present)
+    perturber.move(moved, state.present)
 
 
-def _light_size(stage: Stage, factor: float) -> None:
+def _light_size(perturber: ViewPerturber, factor: float) -> None:
     """Its sides times `factor`, its power as it was."""
-    stage.light_size, stage.light_gain = factor, np.full(3, factor**-2.0)
+    perturber.light_size, perturber.light_gain = factor, np.full(3, factor**-2.0)
 
 
-def _light_colour(stage: Stage, share: float) -> None:
+def _light_colour(perturber: ViewPerturber, share: float) -> None:
     """Mixed with red of the same mean."""
-    stage.light_gain = 1 - share + share * _RED
+    perturber.light_gain = 1 - share + share * _RED
 
 
-def _light_power(stage: Stage, factor: float) -> None:
-    stage.light_gain = np.full(3, factor)
+def _light_power(perturber: ViewPerturber, factor: float) -> None:
+    perturber.light_gain = np.full(3, factor)
 
 
-def _turned_from_light(stage: Stage, degrees: float) -> None:
+def _turned_from_light(perturber: ViewPerturber, degrees: float) -> None:
     """The camera turned about the vertical, until it looks so far past the light in azimuth."""
-    (first, second), up = stage.horizontal, stage._description.up
-    state, light = stage.scene.state, stage._description.light
+    (first, second), up = perturber.horizontal, perturber._description.up
+    state, light = perturber.scene.state, perturber._description.light
     assert light is not None
-    eye, ahead = stage.camera.position, stage.camera.rotation[:, 2]
+    eye, ahead = perturber.camera.position, perturber.camera.rotation[:, 2]
     to_light = light.centre + state.translation[-1] - eye
-    level, sign = np.sqrt(1 - (ahead @ up) ** 2), stage.rng.choice([-1, 1])
+    level, sign = np.sqrt(1 - (ahead @ up) ** 2), perturber.rng.choice([-1, 1])
     for side in (sign, -sign):  # the other way round where that is what shows the room
         azimuth = np.arctan2(to_light[second], to_light[first]) + np.radians(degrees) * side
         direction = (ahead @ up) * up
         direction[[first, second]] = level * np.array([np.cos(azimuth), np.sin(azimuth)])
-        stage.look(eye, eye + direction)
-        if stage.render.views.passes(stage.camera):
+        perturber.look(eye, eye + direction)
+        if perturber.render.views.passes(perturber.camera):
             return
 
 
-def _object_outside(stage: Stage, metres: float) -> None:
+def _object_outside(perturber: ViewPerturber, metres: float) -> None:
     """The largest object, by its points, beyond the horizontal side of its box that faces the room's middle."""
-    state = stage.scene.state
-    k = stage.largest(stage.objects & state.present if (stage.objects & state.present).any() else stage.objects)
-    box, centre = stage.scene.movables[k].box, stage.scene._centres[stage.scene.movables[k].name]
-    to_middle = stage.middle - centre
-    axis = max(stage.horizontal, key=lambda a: abs(to_middle[a]))
+    state = perturber.scene.state
+    k = perturber.largest(
+        perturber.objects & state.present if (perturber.objects & state.present).any() else perturber.objects
+    )
+    box, centre = perturber.scene.movables[k].box, perturber.scene._centres[perturber.scene.movables[k].name]
+    to_middle = perturber.middle - centre
+    axis = max(perturber.horizontal, key=lambda a: abs(to_middle[a]))
     moved, present = state.translation.copy(), state.present.copy()
     moved[k, axis] = box[1, axis] + metres if to_middle[axis] > 0 else box[0, axis] - metres
     present[k] = True
-    stage.move(moved, present)
+    perturber.move(moved, present)
 
 
-def _objects_removed(stage: Stage, share: float) -> None:
+def _objects_removed(perturber: ViewPerturber, share: float) -> None:
     """A share of all objects, the same ones and more at a larger share; the others as they were."""
-    state, objects = stage.scene.state, np.flatnonzero(stage.objects)
+    state, objects = perturber.scene.state, np.flatnonzero(perturber.objects)
     present = state.present.copy()
-    present[stage.rng.permutation(objects)[: round(share * len(objects))]] = False
-    stage.move(state.translation, present)
+    present[perturber.rng.permutation(objects)[: round(share * len(objects))]] = False
+    perturber.move(state.translation, present)
 
 
-def _objects_crowded(stage: Stage, share: float) -> None:
+def _objects_crowded(perturber: ViewPerturber, share: float) -> None:
     """Every object present, and by this share of the way where the room's middle is."""
-    state = stage.scene.state
-    moved, present = state.translation.astype(float), state.present | stage.objects
-    for k in np.flatnonzero(stage.objects):
-        towards = stage.middle - stage.scene._centres[stage.scene.movables[k].name] - moved[k]
-        moved[k, stage.horizontal] += share * towards[stage.horizontal]
-    stage.move(moved, present)
+    state = perturber.scene.state
+    moved, present = state.translation.astype(float), state.present | perturber.objects
+    for k in np.flatnonzero(perturber.objects):
+        towards = perturber.middle - perturber.scene._centres[perturber.scene.movables[k].name] - moved[k]
+        moved[k, perturber.horizontal] += share * towards[perturber.horizontal]
+    perturber.move(moved, present)
 
 
-def _near(stage: Stage, metres: float) -> None:
+def _near(perturber: ViewPerturber, metres: float) -> None:
     """A point of an object from so near, in the same direction."""
-    target = next(stage.surface_points())
-    direction = target - stage.camera.position
-    stage.look(target - metres * direction / np.linalg.norm(direction), target)
+    target = next(perturber.surface_points())
+    direction = target - perturber.camera.position
+    perturber.look(target - metres * direction / np.linalg.norm(direction), target)
 
 
-def _grazing(stage: Stage, degrees: float) -> None:
+def _grazing(perturber: ViewPerturber, degrees: float) -> None:
     """A point from 75 cm, at this angle to its surface."""
-    eye, up = stage.camera.position, stage._description.up
-    for target in stage.surface_points():
+    eye, up = perturber.camera.position, perturber._description.up
+    for target in perturber.surface_points():
         ray = Camera.look_at(eye, target, up, 1.0, 1, 1)
-        normal = stage.render.renderer.gbuffer(ray)["normal"][:, 0, 0].astype(float)
+        normal = perturber.render.renderer.gbuffer(ray)["normal"][:, 0, 0].astype(float)
         back = eye - target
         normal *= np.sign(normal @ back)
         along = back - (back @ normal) * normal
@@ -227,44 +229,44 @@ def _grazing(stage: Stage, degrees: float) -> None:
         place = target + _GRAZING_AT * (
             np.cos(angle) * along / np.linalg.norm(along) + np.sin(angle) * normal / np.linalg.norm(normal)
         )
-        if stage.sees(place, target):
-            stage.look(place, target)
+        if perturber.sees(place, target):
+            perturber.look(place, target)
             return
 
 
-def _field_of_view(stage: Stage, degrees: float) -> None:
-    stage.lens(fov=degrees)
+def _field_of_view(perturber: ViewPerturber, degrees: float) -> None:
+    perturber.lens(fov=degrees)
 
 
-def _corner(stage: Stage, metres: float) -> None:
+def _corner(perturber: ViewPerturber, metres: float) -> None:
     """So far from an edge between two walls, at the camera's height, the room's middle in view."""
-    room, position = stage._description.room, stage.camera.position
+    room, position = perturber._description.room, perturber.camera.position
     assert room is not None
-    a, b = stage.horizontal
-    target = stage.middle.copy()
+    a, b = perturber.horizontal
+    target = perturber.middle.copy()
     best: tuple[float, Camera] | None = None
-    for i, j in stage.rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
+    for i, j in perturber.rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
         place = position.copy()
-        inwards = np.sign(stage.middle - np.where(np.arange(3) == a, room[i], room[j]))
+        inwards = np.sign(perturber.middle - np.where(np.arange(3) == a, room[i], room[j]))
         place[a], place[b] = room[i, a] + inwards[a] * metres, room[j, b] + inwards[b] * metres
-        stage.look(place, target)
-        behind = stage.render.views.shares(stage.camera).back
+        perturber.look(place, target)
+        behind = perturber.render.views.shares(perturber.camera).back
         if best is None or behind < best[0]:
-            best = behind, stage.camera
+            best = behind, perturber.camera
     assert best is not None
-    stage.camera = best[1]
+    perturber.camera = best[1]
 
 
-def _resolution(stage: Stage, factor: float) -> None:
-    stage.lens(width=stage.camera.width * factor, height=stage.camera.height * factor)
+def _resolution(perturber: ViewPerturber, factor: float) -> None:
+    perturber.lens(width=perturber.camera.width * factor, height=perturber.camera.height * factor)
 
 
-def _aspect(stage: Stage, ratio: float) -> None:
+def _aspect(perturber: ViewPerturber, ratio: float) -> None:
     """So many times as wide as high, of as many pixels."""
-    stage.lens(width=stage.camera.width * ratio**0.5, height=stage.camera.height / ratio**0.5)
+    perturber.lens(width=perturber.camera.width * ratio**0.5, height=perturber.camera.height / ratio**0.5)
 
 
-PLACES: dict[str, Callable[[Stage, float], None]] = {
+PLACES: dict[str, Callable[[ViewPerturber, float], None]] = {
     "light_lowered": _light_lowered,
     "light_size": _light_size,
     "light_colour": _light_colour,
@@ -299,24 +301,24 @@ def lacks(spec: DatasetSpec, scene: int, change: str) -> str | None:
 # --- smooth paths ---
 
 
-def path(stage: Stage, kind: str, length: float, frames: int) -> Iterator[Camera]:
+def path(perturber: ViewPerturber, kind: str, length: float, frames: int) -> Iterator[Camera]:
     """Put the scene into the frames of a smooth path, one after the other; their cameras.
 
     The camera goes `length` metres to its right, the light or the largest object `length` of its box along the box's
     longest side, both about where the first test sample has them.
     """
-    camera = stage.place(0)
-    state = stage.scene.state
+    camera = perturber.place(0)
+    state = perturber.scene.state
     for t in np.linspace(-0.5, 0.5, frames):
         if kind == "camera":
             place = camera.position + t * length * camera.rotation[:, 0]
-            stage.look(place, place + camera.rotation[:, 2])
+            perturber.look(place, place + camera.rotation[:, 2])
         else:
-            k = stage.largest(stage.objects if kind == "object" else ~stage.objects)
-            box, moved, present = stage.scene.movables[k].box, state.translation.copy(), state.present.copy()
+            k = perturber.largest(perturber.objects if kind == "object" else ~perturber.objects)
+            box, moved, present = perturber.scene.movables[k].box, state.translation.copy(), state.present.copy()
             axis = int((box[1] - box[0]).argmax())
             moved[k] = box.mean(0)
             moved[k, axis] += t * length * (box[1] - box[0])[axis]
             present[k] = True
-            stage.scene.set_state(SceneState(moved, present))
-        yield stage.camera
+            perturber.scene.set_state(SceneState(moved, present))
+        yield perturber.camera

@@ -13,10 +13,10 @@ import numpy as np
 import scipy.stats
 
 from nlt.data.files import write_bytes
-from nlt.data.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
-from nlt.evaluation.drawing.tables import Table, as_markdown
 from nlt.evaluation.paper import label, order
 from nlt.evaluation.results import MANIFEST, OK, read_rows, write_rows
+from nlt.report.tables import Table, as_markdown
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
 DOUBLED = 2.0  # times the clean error: broken

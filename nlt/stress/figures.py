@@ -9,11 +9,27 @@ from textwrap import fill
 import matplotlib
 import numpy as np
 
-from nlt.data.suites import RENDERED
-from nlt.evaluation.drawing.figures import COLOURS, DASHES, MARKERS, grid, save, shown
-from nlt.evaluation.drawing.stress_report import DOUBLED, Stressed, breaking_point, load_stress, severity, write_stress
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import IMAGES
+from nlt.evaluation.results import IMAGES, MANIFEST
+from nlt.report.figures import COLOURS, DASHES, MARKERS, grid, save, shown
+from nlt.report.page import Section
+from nlt.stress.suites import RENDERED
+from nlt.stress.tables import (
+    BREAKING,
+    DOUBLED,
+    ROWS,
+    STRESS,
+    TEXT,
+    TRAININGS,
+    Stressed,
+    breaking_point,
+    introduction,
+    load_stress,
+    paragraphs,
+    severity,
+    tables,
+    write_stress,
+)  # fmt: skip
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -32,6 +48,19 @@ def draw_stress(directory: Path) -> None:
         _curves(stressed)
         _heat_map(stressed)
         _gallery(stressed)
+
+
+def stress_section(results: Path) -> Section | None:
+    """Draw the stress suites of a comparison's results, and return their section of its report; None without any."""
+    directory = results / STRESS
+    draw_stress(directory)
+    stressed = load_stress(directory)
+    if stressed is None:
+        return None
+    prose = [introduction(stressed), *paragraphs(stressed)]
+    files = (ROWS, BREAKING, TRAININGS, TEXT, MANIFEST)
+    source = f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}"
+    return Section(STRESS, "Where methods fail", prose, tables(stressed), directory, files, source)
 
 
 def _curves(stressed: Stressed) -> None:

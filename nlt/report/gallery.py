@@ -11,10 +11,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from nlt.errors import UserError
-from nlt.evaluation.drawing.figures import grid, save, shown
-from nlt.evaluation.drawing.tables import Table, write_texts
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
+from nlt.report.figures import grid, save, shown
+from nlt.report.tables import Table, write_texts
 
 import matplotlib.pyplot as plt  # isort: skip  after figures.py has chosen the backend
 

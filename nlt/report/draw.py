@@ -1,0 +1,40 @@
+"""`nlt report DIR`: draws tables, figures and report.html from stored results; the same results give the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from nlt.evaluation.claims import text, write_claims
+from nlt.evaluation.results import load
+from nlt.report.figures import draw_samples, draw_speed_accuracy
+from nlt.report.gallery import Shown, draw_failures, draw_qualitative
+from nlt.report.learning_curves import draw_learning_curves
+from nlt.report.page import Section, write_page
+from nlt.report.tables import write_tables
+
+
+def draw(
+    directory: str | Path, megabytes: int | None = None, sections: Iterable[Callable[[Path], Section | None]] = ()
+) -> None:
+    """Write the tables, figures and report.html of the results in a directory.
+
+    Args:
+        megabytes: the largest that report.html may be.
+        sections: functions that add a feature's section to report.html, given the directory.
+
+    Raises:
+        UserError: the directory has no results.
+    """
+    results = load(directory)
+    write_tables(results)
+    claims = write_claims(results)
+    for claim in claims:
+        print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
+    draw_samples(results)
+    draw_speed_accuracy(results)
+    draw_learning_curves(results)
+    if images := Shown.load(results):
+        draw_qualitative(images)
+        draw_failures(images)
+    write_page(results, claims, megabytes, [section(results.directory) for section in sections])
