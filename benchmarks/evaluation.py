@@ -1,11 +1,12 @@
-"""How long does the evaluation of a whole table take, stage by stage, with checkpoints at hand?
+"""Measures how long the evaluation of a whole table takes, stage by stage, without training.
 
     python benchmarks/evaluation.py                          # nine methods, 4 x 64 views at 64x64, all metrics
-    python benchmarks/evaluation.py --methods cnn nlt --views 64     # a part, and what the whole would take by it
+    python benchmarks/evaluation.py --methods cnn nlt --views 64     # a part, extrapolated to the whole
 
-Writes results/benchmarks/evaluation.json. Random weights and samples of random bytes: neither changes what is
-computed. The reference features start from an empty cache; `references_cached_s` is the first method once more, with
-the cache on disk filled, as in a later run. A stage's seconds are those of its calls; what is in none is "rest".
+Writes results/benchmarks/evaluation.json. Weights and samples are random, which does not change the computation. The
+cache of reference features starts empty; `references_cached_s` is the time of the first method when it is evaluated
+again with the cache on disk filled, as in a later run. A stage's seconds are those of its calls; "rest" is the time
+outside all stages.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ STAGES = {
 
 
 def record(seconds: dict[str, float]) -> None:
-    """From now on, every stage adds the time of its calls."""
+    """Make every stage add the time of its calls to `seconds` from now on."""
     for stage, (owner, name) in STAGES.items():
         function = getattr(owner, name)
 
@@ -68,9 +69,9 @@ def record(seconds: dict[str, float]) -> None:
 
 
 def before_and_after(turns: int = 2) -> dict[str, float]:
-    """Least seconds, in turns, one thread: Inception as loaded and as used, 16 images; FID of torchmetrics and ours.
+    """Return the least seconds of Inception, as loaded and as used, on 16 images, and of FID, torchmetrics' and ours.
 
-    Also how much the pooled features differ, relative to the largest, and the distances.
+    The timing is interleaved, in one thread. Also return the relative differences of the pooled features and distances.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -87,7 +88,7 @@ def before_and_after(turns: int = 2) -> dict[str, float]:
     work = {
         "inception_plain_s": lambda: plain(images)["pool"],
         "inception_s": lambda: used(images)["pool"],
-        "fid_torchmetrics_s": lambda: (setattr(theirs, "_computed", None), theirs.compute())[1],  # not as remembered
+        "fid_torchmetrics_s": lambda: (setattr(theirs, "_computed", None), theirs.compute())[1],  # uncached
         "fid_s": lambda: frechet_distance(features[1], features[0]),
     }
     best, result = dict.fromkeys(work, float("inf")), {}
@@ -128,7 +129,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["NLT_CACHE"] = str(Path(folder) / "cache")
         directory = synthetic(spec, folder)
-        # Only methods that path trace ask more of it.
+        # Only methods with path tracing need more of it.
         frames = cast(Frames, SimpleNamespace(dataset=LightTransportDataset(directory, spec, "test")))
         policy = Policy.for_device(device)
         evaluation = judge.Evaluation(frames, device, policy)
@@ -148,7 +149,7 @@ def main() -> None:
         report["references_cached_s"] = evaluate(options.methods[0])["total"]
     rows = list(report["methods"].values())
     report["total_s"] = sum(row["total"] for row in rows)
-    # By views and methods, and the first method, which computes the references, apart: an estimate.
+    # An estimate by the number of views and methods; only the first method computes the references.
     others = rows[1:] or rows
     mean = sum(row["total"] for row in others) / len(others)
     report["nine_methods_256_views_s"] = (rows[0]["total"] + 8 * mean) * 256 / options.views

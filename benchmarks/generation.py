@@ -1,14 +1,14 @@
-"""How fast is generation? Against a bare loop of `mi.render` that traces the same rays, in one run on this machine.
+"""Compares the speed of generation with a bare loop of `mi.render` that traces the same rays on this machine.
 
     python benchmarks/generation.py                  # writes results/benchmarks/generation.json and .md
 
-Same rays: for every sample the objects move (`Scene.set_state`, which is Mitsuba's own `params.update`), then come a
-path-traced image at 1 spp, another at 4, for evaluated samples two at 64; one ray a pixel for depth, normal and albedo
-(the `aov` integrator); one ray a photon from the emitters (`scene.sample_emitter_ray`). Same scene, states, views,
-resolution, variant, threads. The bare loop gets its states and views for nothing, keeps its images no longer than it
-takes to copy them to numpy, and writes nothing; generation samples states and views, checks, stacks, checksums, writes
-and syncs. Both run in the same processes, side by side as in generation, in turns of one shard, so that whatever else
-the machine does slows both.
+For every sample, both move the objects (`Scene.set_state`, which is Mitsuba's own `params.update`) and render a
+path-traced image at 1 spp, another at 4 spp and, for evaluated samples, two at 64 spp. They trace one ray per pixel for
+depth, normal and albedo (the `aov` integrator) and one ray per photon from the emitters (`scene.sample_emitter_ray`).
+Scene, states, views, resolution, variant and threads are the same. The bare loop is given its states and views, keeps
+its images only until they are copied to numpy, and writes nothing; generation samples states and views, checks, stacks,
+checksums, writes and syncs. Both run in the same parallel processes, with interleaved timing of one shard at a time, so
+that other work on the machine slows both.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ SPLITS = ("train", "test")
 
 
 def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[str, Any]:
-    """Seconds of every turn of one shard, by (split, who), and kernels compiled after the first round."""
+    """Return the seconds per sample of every turn, by split and contestant, and kernels compiled after round one."""
     render = SampleRenderer(spec, 0, max(1, available_cpus() // barrier.parties))
     bare = {"bare": Bare(render, frozen=False), "frozen": Bare(render, frozen=True)}
     compiled = dict.fromkeys((*bare, "generation"), 0)
@@ -70,27 +70,27 @@ def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[s
             turns["generation"] = ours
             for who, work in turns.items():
                 barrier.wait()
-                took, kernels = _timed(work)
-                if turn:  # the first one warms up
-                    seconds[f"{split} {who}"].append(took / (shard.stop - shard.start))
+                duration, kernels = _timed(work)
+                if turn:  # the first turn warms up
+                    seconds[f"{split} {who}"].append(duration / (shard.stop - shard.start))
                     compiled[who] += kernels
     return {"seconds": seconds, "compiled": compiled}
 
 
 def _timed(work: Callable[[], None]) -> tuple[float, int]:
-    """Seconds, and kernels that were compiled meanwhile."""
+    """Return the seconds of `work` and the number of kernels compiled meanwhile."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, dr.is_jit_v(mi.Float)):
         if dr.is_jit_v(mi.Float):
             dr.kernel_history_clear()
         start = time.perf_counter()
         work()
-        took = time.perf_counter() - start
+        duration = time.perf_counter() - start
         kernels = dr.kernel_history((dr.KernelType.JIT,)) if dr.is_jit_v(mi.Float) else []
-    return took, sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in kernels)
+    return duration, sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in kernels)
 
 
 def moving(spec: DatasetSpec, rounds: int) -> dict[str, float]:
-    """Median seconds to move every object, until a ray sees it: our instances, and Mitsuba's scene as it is loaded."""
+    """Return the median seconds to move every object until a ray hits it: our instances, and Mitsuba's scene."""
     render = SampleRenderer(spec, 0)
     scene, plain = render.scene, load_source(render.description)
     parameters = mi.traverse(plain)
@@ -153,7 +153,7 @@ def main() -> None:
         whole = replace(spec, train=options.end_to_end, test=0, shard_size=64)
         start = time.perf_counter()
         generate(whole, folder, workers=options.workers)
-        took = time.perf_counter() - start
+        span = time.perf_counter() - start
     rates = {
         key: options.workers / statistics.median(s for result in results for s in result["seconds"][key])
         for key in results[0]["seconds"]
@@ -168,7 +168,7 @@ def main() -> None:
         "kernels_compiled_after_the_first_turn": {
             who: sum(result["compiled"][who] for result in results) for who in results[0]["compiled"]
         },
-        "end_to_end": {"samples": options.end_to_end, "seconds": took, "samples_per_second": options.end_to_end / took},
+        "end_to_end": {"samples": options.end_to_end, "seconds": span, "samples_per_second": options.end_to_end / span},
         "seconds_to_move_all_objects": Process(moving, spec, 20).result(),
         "options": {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items()},
         "turns": [result["seconds"] for result in results],
@@ -199,13 +199,13 @@ def markdown(report: dict[str, Any]) -> str:
         "|---|---:|---:|---:|---:|---:|",
         *rows,
         "",
-        f"Whole command, starting up included: {whole['samples']} training samples in {whole['seconds']:.1f} s, "
+        f"Whole command, including startup: {whole['samples']} training samples in {whole['seconds']:.1f} s, "
         f"{whole['samples_per_second']:.2f} per second. Kernels compiled after the first turn: generation "
         f"{compiled['generation']}, bare loop {compiled['bare']}, frozen {compiled['frozen']}. "
-        "To move all objects until a ray sees them: instances "
-        f"{1e3 * moved['instances']:.1f} ms, the scene's meshes as loaded {1e3 * moved['meshes']:.1f} ms.",
+        "Moving all objects until a ray hits them: instances "
+        f"{1e3 * moved['instances']:.1f} ms, the scene's own meshes {1e3 * moved['meshes']:.1f} ms.",
         "",
-        f"`{report['manifest']['command']}`, medians over turns of {options['shard']} samples; what the rays are: see "
+        f"`{report['manifest']['command']}`, medians over turns of {options['shard']} samples; for the rays, see "
         "benchmarks/generation.py.",
         "",
     ])  # fmt: skip

@@ -1,11 +1,11 @@
-"""How small may a model be, and how much of the learned 3D network does a scene need?
+"""Finds how small a model may be, and how much of the learned 3D network a scene needs.
 
     python benchmarks/leaner.py --seeds 3
     python benchmarks/leaner.py --judge results/leaner results/photon_splat/bedroom
 
-Runs `nlt compare` for five sizes of networks (results/leaner), and for photon splats in three settings and with three
-photon counts (results/photon_splat); each goes on where it ended. Then, from the stored results alone (`--judge`),
-writes leanest.md beside them: the cheapest method that is worse than the best by no more than seeds make it differ.
+Runs `nlt compare` for five network sizes (results/leaner), and for photon splats in three settings and with three
+photon counts (results/photon_splat); a stopped run resumes. Then writes leanest.md to each directory from the stored
+results alone (`--judge` does only this): the cheapest method that is worse than the best by no more than seed noise.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nlt.evaluation.paper import label
 from nlt.evaluation.results import LEVEL, Results, load
 from nlt.metrics.quantities import METRICS
 
-STUDIES = {  # where results go: arguments of nlt compare
+STUDIES = {  # directory of the results: arguments of nlt compare
     "results/photon_splat/living_room": "--config photon_splat",
     "results/photon_splat/bedroom": "--config photon_splat --data leaner/bedroom",
     "results/photon_splat/living_room_fixed_lights": "--config photon_splat --data demo_fixed_lights",
@@ -39,7 +39,7 @@ KEYS = ("mse", "mssim")
 
 @dataclass(frozen=True)
 class Row:
-    """A method beside the best of its group; `loss` is the fraction by which its error is larger."""
+    """A method compared with the best of its group; `loss` is the fraction by which its error is larger."""
 
     method: str
     value: float
@@ -50,16 +50,16 @@ class Row:
 
 
 def rank(results: Results, methods: list[str], key: str) -> tuple[list[Row], float]:
-    """Methods, the cheapest first, and the least loss that is more than seed noise (Fisher's LSD).
+    """Return the methods, the cheapest first, and the least loss that exceeds seed noise (Fisher's LSD).
 
-    Errors (MSSIM's: 1 - MSSIM) are compared by their logarithms, whose variance over seeds is taken to be every
-    method's and pooled. Test images are the same for all.
+    Errors (1 - MSSIM for MSSIM) are compared by their logarithms, whose variance over seeds is assumed equal for all
+    methods and pooled. Test images are the same for all.
     """
     errors = {m: results.values(m, key) for m in methods}
     errors = {m: np.log(v if METRICS[key].direction == "lower" else 1 - v) for m, v in errors.items() if len(v)}
     freedom, seeds = sum(len(v) - 1 for v in errors.values()), min(len(v) for v in errors.values())
     if not freedom:
-        raise UserError(f"{results.directory}: has one seed, so no noise of seeds; compare with 2 seeds or more")
+        raise UserError(f"{results.directory}: has one seed, so seed noise is unknown; compare with 2 seeds or more")
     variance = sum(((v - v.mean()) ** 2).sum() for v in errors.values()) / freedom
     noise = scipy.stats.t.ppf((1 + LEVEL) / 2, freedom) * math.sqrt(2 * variance / seeds)
     best = min(v.mean() for v in errors.values())
@@ -72,7 +72,7 @@ def rank(results: Results, methods: list[str], key: str) -> tuple[list[Row], flo
 
 
 def groups(results: Results) -> list[list[str]]:
-    """Sizes of one method; if there are none but photon counts, all methods together."""
+    """Group the sizes of each method; without sizes, or with photon counts only, all methods are one group."""
     sized: dict[str, list[str]] = {}
     for method in results.methods:
         name, _, size = method.partition("@")
@@ -81,20 +81,20 @@ def groups(results: Results) -> list[list[str]]:
 
 
 def judge(directory: Path) -> str:
-    """leanest.md of a comparison's results, and its text."""
+    """Write leanest.md of a comparison's results and return its text."""
     results = load(directory)
     seeds = len(results.manifest["seeds"])
     scenes = f"{', '.join(results.manifest['scenes'])} ({results.manifest['dataset'].partition('-')[0]})"
-    lines = [f"# The leanest that loses nothing beyond seed noise: {scenes}", ""]
+    lines = [f"# The leanest method without a loss beyond seed noise: {scenes}", ""]
     for methods in groups(results):
         for key in KEYS:
             rows, noise = rank(results, methods, key)
             named = lambda row: f"{label(row.method)} ({1e3 * row.time:.1f} ms a frame)"
-            found, best = next(row for row in rows if row.enough), min(rows, key=lambda row: row.loss)
+            leanest, best = next(row for row in rows if row.enough), min(rows, key=lambda row: row.loss)
             metric = METRICS[key]
             lines += [
-                f"**{metric.label}: {named(found)}.** The best is {named(best)}. "
-                f"A loss below {noise:.0%} may be noise of {seeds} seeds.",
+                f"**{metric.label}: {named(leanest)}.** The best is {named(best)}. "
+                f"A loss below {noise:.0%} may be the noise of {seeds} seeds.",
                 "", f"| method | {metric.label} | loss | beyond noise | time per frame (ms) | parameters |",
                 "|---|---:|---:|---|---:|---:|",
             ]  # fmt: skip
@@ -103,7 +103,7 @@ def judge(directory: Path) -> str:
                 f"{'no' if row.enough else 'yes'} | {1e3 * row.time:.1f} | {row.parameters:,} |" for row in rows
             ]  # fmt: skip
             lines.append("")
-    lines += ["Loss: of the error (1 - MSSIM for MSSIM) above that of the best. Means over seeds.",
+    lines += ["Loss: the fraction by which the error (1 - MSSIM for MSSIM) exceeds the best. Means over seeds.",
               f"`python benchmarks/leaner.py --judge {directory}`"]  # fmt: skip
     text = "\n".join(lines) + "\n"
     write_bytes(directory / "leanest.md", text.encode())
@@ -113,14 +113,14 @@ def judge(directory: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=1, help="trainings side by side")
+    parser.add_argument("--workers", type=int, default=1, help="trainings in parallel")
     parser.add_argument("--only", nargs="+", choices=STUDIES, default=list(STUDIES), help="studies to run")
     parser.add_argument("--judge", nargs="+", metavar="DIR", help="only judge these results")
     options = parser.parse_args()
     for directory in options.judge or options.only:
         if not options.judge:
             more = [f"--seeds={options.seeds}", f"--workers={options.workers}", f"--out={directory}"]
-            sys.argv = ["nlt", "compare", *STUDIES[directory].split(), *more]  # as the manifest will have it
+            sys.argv = ["nlt", "compare", *STUDIES[directory].split(), *more]  # the manifest records it
             if code := nlt.cli.main(sys.argv[1:]):
                 sys.exit(code)
         print(judge(Path(directory)), flush=True)

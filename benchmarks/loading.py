@@ -1,12 +1,12 @@
-"""How fast does training read? Against reading the same bytes with a CRC and nothing else, in one run on this machine.
+"""Compares the speed of training's data loading with only reading the same bytes and their CRC on this machine.
 
     python benchmarks/loading.py                     # writes results/benchmarks/loading.json
 
 A dataset of random bytes in the format of nlt/data/sample.py is written to a temporary folder and read from the page
 cache. The loader is the DataModule's own, with its shuffling, its processes and its CRCs, and its batches arrive in
-this process. The ceiling, in as many processes: `np.fromfile` of the bytes that the method reads of a sample, and
-their zlib.crc32. Both take turns, so that whatever else the machine does slows both; medians and best over turns.
-`cpu_ms` is the processor time of one sample without processes, which other work slows least.
+this process. The ceiling is `np.fromfile` of the bytes that the method reads of a sample, and their zlib.crc32, in as
+many processes. The timing is interleaved, so that other work on the machine slows both; medians and best over turns are
+reported. `cpu_ms` is the processor time of one sample without worker processes, which other work affects least.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from nlt.paths import find_config
 
 
 def synthetic(spec: DatasetSpec, root: str) -> Path:
-    """A dataset of random numbers in the form that `spec` says; its directory."""
+    """Write a dataset of random numbers in the form of `spec` and return its directory."""
     rng, sizes, directory = np.random.default_rng(0), spec.sizes, Path(str(spec.directory(root)))
 
     def array(field: Field) -> np.ndarray:
@@ -68,7 +68,7 @@ def synthetic(spec: DatasetSpec, root: str) -> Path:
 
 
 def build(method: str, spec: DatasetSpec, width: int) -> Method:
-    """A method with random weights."""
+    """Return a method with random weights."""
     model: Any = yaml.safe_load(find_config("model", method).read_text())["model"]
     kind: Any = pydoc.locate(model["class_path"])
     more = {"width": width, "num_scenes": len(spec.scenes), "num_points": spec.points}
@@ -76,7 +76,7 @@ def build(method: str, spec: DatasetSpec, width: int) -> Method:
 
 
 class Bare(Dataset):
-    """`nbytes` of a file and their CRC, for every sample."""
+    """A dataset that reads `nbytes` of a file for every sample and returns their CRC."""
 
     def __init__(self, file: Path, nbytes: int, count: int) -> None:
         self.file, self.nbytes, self.count = file, nbytes, count
@@ -89,7 +89,7 @@ class Bare(Dataset):
 
 
 def rate(loader: DataLoader, samples: int) -> float:
-    """Samples per second of one pass, once the processes are up."""
+    """Return the samples per second of one pass, after the processes have started."""
     iterator = iter(loader)
     next(iterator)
     start = time.perf_counter()
@@ -99,7 +99,7 @@ def rate(loader: DataLoader, samples: int) -> float:
 
 
 def cpu_ms(dataset: LightTransportDataset, batch: int) -> float:
-    """Least processor time of a sample, in batches, in this process."""
+    """Return the least processor time of a sample in ms, read in batches in this process."""
     times = []
     for start in range(0, len(dataset) - batch + 1, batch):
         before = os.times()

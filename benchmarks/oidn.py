@@ -1,6 +1,6 @@
-"""How long does Open Image Denoise take in each of its modes? The images are random, which does not change its times.
+"""Measures the time of Open Image Denoise in each of its modes, on random images, which do not change the times.
 
-python benchmarks/oidn.py                              # writes results/benchmarks/oidn.json and oidn.md
+Usage: python benchmarks/oidn.py                              # writes results/benchmarks/oidn.json and oidn.md
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.paths import PROJECT
 
-SIZES = (16, 64, 128, 256)  # 16 shows what does not grow with the pixels
+SIZES = (16, 64, 128, 256)  # 16 shows the cost that does not grow with the pixels
 WARM_UP, TIMED, ROUNDS = 3, 10, 4
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=PROJECT / "results/benchmarks")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     record = {**origin(), **surroundings(device), "load_average": {"before": os.getloadavg()}}
     times: dict[tuple[str, int], list[float]] = {}
-    for _ in range(ROUNDS):  # other work on the machine then slows every mode alike
+    for _ in range(ROUNDS):  # interleaved, so that other work on the machine slows all modes alike
         for quality in get_args(Quality):
             for size in SIZES:
                 times.setdefault((quality, size), []).extend(measure(quality, size, device))
@@ -42,7 +42,7 @@ def main() -> None:
     record["load_average"]["after"] = os.getloadavg()
     before, after = (load[0] for load in record["load_average"].values())
     note = (
-        "Milliseconds of `denoise` alone: median, in brackets the fastest. "
+        "Milliseconds of `denoise` alone: the median and, in brackets, the fastest. "
         f"{record['device']}; load average {before:.1f} before, {after:.1f} after. `python benchmarks/oidn.py`"
     )
     text = f"# Open Image Denoise\n\n{table(times)}\n\n{note}\n"
@@ -52,23 +52,23 @@ def main() -> None:
 
 
 def measure(quality: Quality, size: int, device: torch.device) -> list[float]:
-    """Milliseconds of each timed image of size x size pixels."""
+    """Return the milliseconds of each timed image of size x size pixels."""
     traced, albedo, normal = torch.rand(3, 1, 3, size, size, device=device)
     batch = {"traced": traced, "albedo": albedo, "normal": normal, "exposure": torch.ones(1, device=device)}
-    method, found = OpenImageDenoise(quality=quality), []
+    method, times = OpenImageDenoise(quality=quality), []
     for _ in range(WARM_UP + TIMED):
         start = time.perf_counter()
         method(batch).cpu()  # waits for the device
-        found.append(1e3 * (time.perf_counter() - start))
-    return found[WARM_UP:]
+        times.append(1e3 * (time.perf_counter() - start))
+    return times[WARM_UP:]
 
 
 def table(times: dict[tuple[str, int], list[float]]) -> str:
-    """A row per mode: its median and, in brackets, its fastest time at each size."""
+    """Return a row per mode: its median and, in brackets, its fastest time at each size."""
     lines = [f"| mode | {' | '.join(f'{n}x{n}' for n in SIZES)} |", f"|---|{'---:|' * len(SIZES)}"]
     for quality in get_args(Quality):
-        found = [times[quality, size] for size in SIZES]
-        lines.append(f"| {quality} | {' | '.join(f'{statistics.median(ms):.1f} ({min(ms):.1f})' for ms in found)} |")
+        by_size = [times[quality, size] for size in SIZES]
+        lines.append(f"| {quality} | {' | '.join(f'{statistics.median(ms):.1f} ({min(ms):.1f})' for ms in by_size)} |")
     return "\n".join(lines)
 
 

@@ -1,11 +1,11 @@
-"""At equal wall time, which trains better: a stored set, seen again every epoch, or samples rendered online?
+"""Compares training on a stored set, seen again every epoch, and on samples rendered online, at equal wall time.
 
     python benchmarks/online.py --minutes 30 --sizes 256 1024 4096
 
-Every arm trains the same method with the same settings for the same time; 20 times on the way its weights are put
-aside, and judged on the test split afterwards. The stored sets are generated first, by all cores, and timed. The
-learning rate does not decay, for arms differ in what an epoch is. Writes table.md, table.csv, curve.png and
-manifest.json; an arm that is done is not done again.
+Every arm trains the same method with the same settings for the same time; its weights are saved 20 times on the way and
+evaluated on the test split afterwards. The stored sets are generated first, on all cores, and timed. The learning rate
+does not decay, because arms differ in the length of an epoch. Writes table.md, table.csv, curve.png and manifest.json;
+a finished arm is not run again.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ ACCOUNTS = {"without_generation": "Training time alone", "with_generation": "Wit
 
 
 class Snapshots(L.Callback):
-    """Puts the weights aside at `times` in seconds, the time to do so not counted, and ends the training."""
+    """Saves the weights at `times` in seconds, without counting the time to save, and ends the training."""
 
     def __init__(self, times: list[float], label: str) -> None:
         self.times, self.begin, self.taken = list(times), time.perf_counter(), list[Row]()
@@ -73,7 +73,7 @@ class Snapshots(L.Callback):
 
 
 def train(config: Row, spec: DatasetSpec, root: Path, size: int | None, seed: int, times: list[float]) -> list[Row]:
-    """Snapshots of one arm: a stored set of `size` samples per scene, or None, online."""
+    """Train one arm, on a stored set of `size` samples per scene or online if None, and return its snapshots."""
     L.seed_everything(seed, verbose=False)
     module = build(config, spec, seed)
     keys = {name: config["data"][name] for name in ("batch_size", "workers") if name in config["data"]}
@@ -98,7 +98,7 @@ def build(config: Row, spec: DatasetSpec, seed: int) -> RenderingModule:
 
 
 def judge(module: RenderingModule, batches: list[Batch], snapshots: list[Row]) -> list[Row]:
-    """The snapshots with metrics in place of weights."""
+    """Return the snapshots with metrics in place of weights."""
     rows = []
     for snapshot in snapshots:
         module.load_state_dict(snapshot["weights"])
@@ -112,11 +112,14 @@ def judge(module: RenderingModule, batches: list[Batch], snapshots: list[Row]) -
 
 
 def generate_timed(spec: DatasetSpec, root: Path, base: Path) -> float:
-    """Seconds to generate the training samples of a set; what is evaluated comes from `base`. Kept once it is done."""
+    """Return the seconds to generate a set's training samples, from a record if there is one.
+
+    The evaluated samples are copied from `base`.
+    """
     directory = spec.directory(root)
     record = Path(root) / f"{directory.name}.json"
     if not record.exists():
-        shutil.rmtree(directory, ignore_errors=True)  # begun and not timed to its end; nothing but ours lies here
+        shutil.rmtree(directory, ignore_errors=True)  # begun but not timed; only this benchmark writes here
         for name in dataset_files(spec.without_train()):
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(base / name, directory / name)
@@ -131,7 +134,7 @@ def label(size: int | None) -> str:
 
 
 def at(rows: list[Row], arm: str, key: str, budget: float, account: str) -> float | None:
-    """What an arm had reached after `budget` seconds, interpolated, mean over seeds; None before a first snapshot."""
+    """Return an arm's metric after `budget` seconds, interpolated, mean over seeds; None before a first snapshot."""
     values = []
     for seed in sorted({row["seed"] for row in rows if row["arm"] == arm}):
         mine = [row for row in rows if (row["arm"], row["seed"]) == (arm, seed)]
@@ -143,7 +146,7 @@ def at(rows: list[Row], arm: str, key: str, budget: float, account: str) -> floa
 
 
 def write_table(path: Path, rows: list[Row], budgets: list[float]) -> None:
-    """By metric and account: a row per budget, a column per arm, the best in bold."""
+    """Write a table per metric and account: a row per budget, a column per arm, the best in bold."""
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     last = {arm: [r for r in rows if r["arm"] == arm][-1] for arm in arms}
     lines = ["# Stored sets against online rendering at equal wall time", ""]
@@ -158,18 +161,18 @@ def write_table(path: Path, rows: list[Row], budgets: list[float]) -> None:
             lines += ["| minutes | " + " | ".join(arms) + " | best |", "|---:|" + "---:|" * len(arms) + "---|"]
             for budget in budgets:
                 values = {arm: at(rows, arm, key, budget, account) for arm in arms}
-                there = {arm: value for arm, value in values.items() if value is not None}
+                reached = {arm: value for arm, value in values.items() if value is not None}
                 pick = min if metric.direction == "lower" else max
-                best = pick(there, key=lambda arm: there[arm]) if there else ""
+                best = pick(reached, key=lambda arm: reached[arm]) if reached else ""
                 cells = ["" if v is None else f"{v:{metric.format}}" for v in values.values()]
                 cells = [f"**{c}**" if arm == best else c for arm, c in zip(arms, cells, strict=True)]
                 lines.append(f"| {budget / 60:g} | " + " | ".join(cells) + f" | {best} |")
-    lines += ["", "An empty cell: the set was still being generated, or nothing trained on it yet. Means over seeds."]
+    lines += ["", "An empty cell: the set was still being generated, or no snapshot was made yet. Means over seeds."]
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def draw(path: Path, rows: list[Row]) -> None:
-    """MSE over wall time; left training alone, right with generation; a thin line per seed."""
+    """Plot MSE over wall time: on the left training alone, on the right with generation; a thin line per seed."""
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
     for axis, (account, title) in zip(axes, ACCOUNTS.items(), strict=True):
@@ -191,10 +194,10 @@ def draw(path: Path, rows: list[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="demo", help="of configs/data")
-    parser.add_argument("--scale", default="demo", help="of configs/scale; its train is an epoch online")
-    parser.add_argument("--method", default="nlt", help="of configs/model")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of training, for each arm")
+    parser.add_argument("--data", default="demo", help="a config in configs/data")
+    parser.add_argument("--scale", default="demo", help="a config in configs/scale, whose train is an epoch online")
+    parser.add_argument("--method", default="nlt", help="a config in configs/model")
+    parser.add_argument("--minutes", type=float, default=20.0, help="training time of each arm")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 1024], help="samples per scene in stored sets")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each arm")
     parser.add_argument("--out", default="results/online")

@@ -1,10 +1,10 @@
-"""What do bfloat16 and 8-bit integers cost in accuracy? Trained methods on their test views, three ways.
+"""Measures what bfloat16 and 8-bit integers cost in accuracy: trained methods on their test views, in three precisions.
 
     python benchmarks/precision.py                           # writes results/benchmarks/precision.json
     python benchmarks/precision.py --config table2 --methods cnn --seeds 3
 
-Takes the trainings that `nlt compare --config CONFIG --seeds SEEDS` has made; a method without one is left out and
-said to be. A policy's figure is relative to float32's on the same weights and views: 0.001 is a tenth of a percent.
+Uses the trainings of `nlt compare --config CONFIG --seeds SEEDS`; a method without a training is left out, which is
+printed. A policy's figure is relative to float32's on the same weights and views: 0.001 is a tenth of a percent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KEYS = ("mse", "mssim")
 
 @torch.inference_mode()
 def judge(method: RenderingModule, dataset: LightTransportDataset, policy: Policy) -> dict[str, float]:
-    """Means over the views of the metrics in KEYS."""
+    """Return the means over the views of the metrics in KEYS."""
     metrics = ImageMetrics(perceptual=False)
     with policy.applied(torch.device("cpu")):
         for batch in DataLoader(dataset, batch_size=16, collate_fn=identity_collate):

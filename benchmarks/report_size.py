@@ -1,9 +1,9 @@
-"""How large is report.html, and how precise are its images? Of results with images, at their size and at twice it.
+"""Measures the size of report.html and the precision of its images, at the images' own size and at twice that.
 
     python benchmarks/report_size.py results/demo          # writes results/benchmarks/report_size.json
 
-Twice the size: every image becomes four of them, of four views, side by side. A rendering of twice the resolution is
-smoother from pixel to pixel, so packs better.
+Twice the size: every image becomes four images, of four views, in a square. A real rendering at twice the resolution is
+smoother from pixel to pixel, so it compresses better.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nlt.report.page import PAGE
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--out", type=Path, default=PROJECT / "results/benchmarks/report_size.json")
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def measure(directory: Path, factor: int) -> dict[str, str | int]:
-    """Bytes of the report, and what it says of its images."""
+    """Return the report's bytes, its images' resolution, and its note on their precision."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         for name in (MANIFEST, RUNS, VIEWS):
@@ -51,13 +51,13 @@ def measure(directory: Path, factor: int) -> dict[str, str | int]:
         draw(copy)
         text = (copy / PAGE).read_text()
         says = re.search(r'<p class="note">([^<]*linear radiance[^<]*)', text)
-        found = {"resolution": int(re.findall(r'"width":(\d+)', text)[0]), "bytes": len(text.encode())}
-        print(found, says and says[1])
-        return found | {"says": says[1] if says else ""}
+        size = {"resolution": int(re.findall(r'"width":(\d+)', text)[0]), "bytes": len(text.encode())}
+        print(size, says and says[1])
+        return size | {"says": says[1] if says else ""}
 
 
 def tiled(array: np.ndarray, factor: int) -> np.ndarray:
-    """Images (V, ..., H, W) beside those of the next views, (V, ..., factor H, factor W); other arrays as they are."""
+    """Tile images (V, ..., H, W) with those of the next views to (V, ..., factor H, factor W), but no other arrays."""
     if array.ndim < 3:
         return array
     rows = [[np.roll(array, factor * i + j, axis=0) for j in range(factor)] for i in range(factor)]

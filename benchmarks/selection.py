@@ -1,10 +1,10 @@
-"""Does `nlt select` pick what a scene needs? Three scenes of different needs, and what each pick saves.
+"""Checks whether `nlt select` picks the model that a scene needs, in three scenes, and what each pick saves.
 
     python benchmarks/selection.py --minutes 6
 
 Runs `nlt select` for a static scene, a room with fixed lights and one with a moving light, and writes summary.md and
 summary.csv: each pick against always taking the full model and against picking by the number of parameters. A claim
-that does not hold is printed as failing. A selection that is there and complete is not made again.
+that does not hold is printed as failing. A complete selection is not repeated.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ CASES = {"static_egg": "static_egg", "fixed_lights": "fixed_lights", "moving_lig
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, help="for each (default: the config's)")
+    parser.add_argument("--minutes", type=float, help="time of each selection (default: the config's)")
     parser.add_argument("--out", type=Path, default=Path("results/select"))
     options = parser.parse_args()
-    found: dict[str, list[dict[str, Any]]] = {}
+    confirmed: dict[str, list[dict[str, Any]]] = {}
     for case, config in CASES.items():
         directory = options.out / case
         if not (directory / "front.svg").exists():
             minutes = [f"--minutes={options.minutes}"] if options.minutes else []
             command = [sys.executable, "-m", "nlt.cli", "select", "--config", config, "--out", str(directory), *minutes]
-            subprocess.run(command, check=True)  # a process each: Mitsuba's memory grows with every scene
-        found[case] = read_rows(directory / "confirmed.csv")
-    write_rows(options.out / "summary.csv", [{"case": case, **row} for case, rows in found.items() for row in rows])
-    text = summary(found)
+            subprocess.run(command, check=True)  # own processes: Mitsuba's memory grows with every scene
+        confirmed[case] = read_rows(directory / "confirmed.csv")
+    write_rows(options.out / "summary.csv", [{"case": case, **row} for case, rows in confirmed.items() for row in rows])
+    text = summary(confirmed)
     write_bytes(options.out / "summary.md", text.encode())
     print(text)
 

@@ -1,4 +1,4 @@
-"""The one entry point, `nlt`. Parsing only: whatever is heavy is imported inside its subcommand."""
+"""The command line, `nlt`. This module only parses arguments; each subcommand imports its heavy modules itself."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from nlt.errors import UserError, to_user_error
 from nlt.waiting import wait_passively
 
 _LIGHTNING = {
-    "fit": "train one method, of configs of data, model and scale",
-    "validate": "compute the validation metrics of a checkpoint, of the same configs",
+    "fit": "train one method with configs of data, model and scale",
+    "validate": "compute the validation metrics of a checkpoint with the same configs",
     "test": "compute all metrics of a checkpoint on the test split",
-    "predict": "write a checkpoint's images of the test split",
+    "predict": "write the images that a checkpoint predicts for the test split",
 }
 
-# Commands in which Mitsuba and PyTorch take turns at frames.
+# Commands in which Mitsuba and PyTorch alternate within a frame.
 _FRAMES = ("bench", "compare", "render")
 
-# Words of several commands' help.
-_OUT, _IMAGE = "directory of the results (default: {})", "image to write (default: {})"
+# Help texts of several commands.
+_OUT, _IMAGE = "directory for the results (default: {})", "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
-_VIEWS, _SIDE = "random views of each scene", "height and width of an image"
+_VIEWS, _SIDE = "random views per scene", "image height and width in pixels"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command. Returns the exit code: 0, or 2 for a user's mistake, said in one line."""
+    """Run a command and return the exit code: 0, 2 after a user error (printed in one line), 130 if interrupted."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         return _run(arguments)
@@ -40,13 +40,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"nlt: error: {to_user_error(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("nlt: interrupted; run the same command again to go on", file=sys.stderr)
+        print("nlt: interrupted; run the same command again to continue", file=sys.stderr)
         return 130
 
 
 class _Commands(argparse._SubParsersAction):
     def add_parser(self, name: str, *, help: str, **options: Any) -> Any:  # type: ignore[override]
-        """A command's own help begins with what the list of commands says of it."""
+        """Add a command whose own help begins with its text in the list of commands."""
         return super().add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", **options)
 
 
@@ -56,7 +56,7 @@ class _Parser(argparse.ArgumentParser):
         self.register("action", "parsers", _Commands)
 
     def error(self, message: str) -> NoReturn:
-        """One line for a mistake here as everywhere."""
+        """Raise a user error, which is printed in one line."""
         raise UserError(f"{message}; see {self.prog} --help")
 
 
@@ -93,8 +93,8 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "stress":
         from nlt.stress.run import stress
 
-        how = (options.methods, options.suites, options.manifest, options.views)
-        stress(options.config, options.out, options.scale, options.data, *how)
+        selection = (options.methods, options.suites, options.manifest, options.views)
+        stress(options.config, options.out, options.scale, options.data, *selection)
     elif options.command == "report":
         _draw(options.directory, options.megabytes)
     elif options.command == "dashboard":
@@ -117,10 +117,10 @@ def _compare(options: argparse.Namespace) -> None:
     from nlt.evaluation.results import load
     from nlt.report.tables import write_tables
 
-    chosen = (options.scale, options.data, options.methods, options.seeds, options.precision)
-    comparison, slurm = Comparison.load(options.config, *chosen), dict(options.slurm)
-    where = (options.out, options.workers, options.scheduler, slurm)
-    directory = compare(comparison, *where, options.train_images, lambda directory: write_tables(load(directory)))
+    overrides = (options.scale, options.data, options.methods, options.seeds, options.precision)
+    comparison, slurm = Comparison.load(options.config, *overrides), dict(options.slurm)
+    run_options = (options.out, options.workers, options.scheduler, slurm)
+    directory = compare(comparison, *run_options, options.train_images, lambda folder: write_tables(load(folder)))
     _draw(directory)
     print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
 
@@ -150,7 +150,7 @@ def _bench(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     if options.demo == bool(options.checkpoint) or (options.checkpoint and not options.scene):
-        raise UserError("give CKPT and SCENE, or --demo alone; see nlt render --help")
+        raise UserError("give either CKPT and SCENE or --demo; see nlt render --help")
     from nlt.evaluation.render import DEMO, render
 
     demo = options.demo
@@ -197,84 +197,86 @@ def _scenes(options: argparse.Namespace) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="nlt", description="Learned light transport: which renderer for this scene and this time budget?",
-        epilog="`nlt compare --config demo` shows all of it in minutes; more in docs/commands.md.",
+        prog="nlt", description="Learned light transport: find the best renderer for a scene and a time budget.",
+        epilog="`nlt compare --config demo` runs everything in minutes; docs/commands.md describes all commands.",
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"nlt {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    generate = commands.add_parser("generate", help="render a dataset, or what is missing of it")
+    generate = commands.add_parser("generate", help="render a dataset, or its missing files")
     generate.add_argument(
-        "--config", action="append", required=True, help="a YAML file; later ones override earlier ones"
+        "--config", action="append", required=True, help="YAML file; later files override earlier ones"
     )
-    _add_scheduler(generate, "jobs side by side (default: as many as cores; on Dask, as threads; in a Slurm array, 64)")
+    _add_scheduler(generate, "concurrent jobs (default: available CPUs; on Dask, its threads; in a Slurm array, 64)")
     data = commands.add_parser("data", help="show, verify or measure a dataset")
     _add_data(data)
     for name, text in _LIGHTNING.items():
-        # Handed to Lightning's own parser before this one sees it; here for the help.
+        # Lightning's own parser handles these commands; they are here for the help.
         commands.add_parser(name, help=text)
-    compare = commands.add_parser("compare", help="make a table of methods: generate, train, evaluate, time, draw")
-    stress = commands.add_parser("stress", help="find where a comparison's methods break: suites of growing severity")
+    compare = commands.add_parser("compare", help="compare methods: generate, train, evaluate, time and draw")
+    stress = commands.add_parser("stress", help="find where a comparison's methods fail, at increasing severity")
     for command in (compare, stress):
-        command.add_argument("--config", required=True, help="a comparison of configs/compare, by name or path")
-        command.add_argument("--out", help="directory of the results (default: results/NAME, or NAME-SCALE-DATA)")
-        command.add_argument("--scale", help="of configs/scale, by name or path (default: the comparison's)")
-        command.add_argument("--data", help="of configs/data, by name or path (default: the comparison's)")
-        command.add_argument("--methods", nargs="+", help="of configs/model (default: the comparison's, else all)")
-    stress.add_argument("--suites", nargs="+", type=_suite, help="of the manifest (default: all)")
-    stress.add_argument("--manifest", default="suites", help="of configs/stress, by name or path (default: suites)")
-    stress.add_argument("--views", type=_positive, help="of each scene (default: the manifest's)")
-    compare.add_argument("--seeds", type=_positive, default=1, help="trainings of each method (default: 1)")
+        command.add_argument("--config", required=True, help="comparison in configs/compare, by name or path")
+        command.add_argument("--out", help="directory for the results (default: results/NAME or NAME-SCALE-DATA)")
+        command.add_argument("--scale", help="config in configs/scale, by name or path (default: the comparison's)")
+        command.add_argument("--data", help="config in configs/data, by name or path (default: the comparison's)")
+        command.add_argument("--methods", nargs="+", help="configs in configs/model (default: the comparison's or all)")
+    stress.add_argument("--suites", nargs="+", type=_suite, help="suites in the manifest (default: all)")
+    stress.add_argument(
+        "--manifest", default="suites", help="file in configs/stress, by name or path (default: suites)"
+    )
+    stress.add_argument("--views", type=_positive, help="views per scene (default: the manifest's)")
+    compare.add_argument("--seeds", type=_positive, default=1, help="training runs per method (default: 1)")
     compare.add_argument(
         "--train-images", nargs="+", type=_positive, default=[], metavar="N",
-        help="also train every method on the first N images of each scene, for the learning curves",
+        help="also train every method on the first N images of each scene, for learning curves",
     )  # fmt: skip
-    _add_scheduler(compare, "trainings side by side (default: one; on a cluster as nlt generate)")
+    _add_scheduler(compare, "concurrent training runs (default: 1; on a cluster, as for nlt generate)")
     compare.add_argument(
         "--precision", choices=("auto", "32", "bf16"), default="auto",
-        help="of what is trained, judged and timed (default: auto, bf16 where the device multiplies it)",
+        help="precision of training, evaluation and timing (default: auto, bf16 if the device supports it natively)",
     )  # fmt: skip
-    _add_bench(commands.add_parser("bench", help="measure what a frame, a training step and a sample cost"))
-    export = commands.add_parser("export", help="write a trained network as one file that runs with PyTorch alone")
-    export.add_argument("checkpoint", metavar="CKPT", help="a checkpoint of nlt fit")
+    _add_bench(commands.add_parser("bench", help="measure the cost of a frame, a training step and a sample"))
+    export = commands.add_parser("export", help="export a trained network as one file that only needs PyTorch")
+    export.add_argument("checkpoint", metavar="CKPT", help="checkpoint from nlt fit")
     export.add_argument(
         "-o", "--output", required=True,
-        help="file of the torch.export program, such as nlt.pt2; NAME.safetensors: the weights, for nlt render",
+        help="torch.export program, for example nlt.pt2, or NAME.safetensors: only the weights, for nlt render",
     )  # fmt: skip
     export.add_argument(
-        "--resolution", type=_positive, default=256, help="height and width of its images (default: 256)"
+        "--resolution", type=_positive, default=256, help="image height and width in pixels (default: 256)"
     )
-    export.add_argument("--photons", type=_positive, default=10000, help="how many it is given (default: 10000)")
-    _add_render(commands.add_parser("render", help="make a video of a scene by a trained method, beside path tracing"))
-    select = commands.add_parser("select", help="find the smallest model that a scene needs, within minutes")
-    select.add_argument("--config", required=True, help="a ladder of configs/select, by name or path")
-    select.add_argument("--minutes", type=float, help="to measure and train in (default: the ladder's)")
-    select.add_argument("--out", help="directory of the results (default: results/select/NAME)")
+    export.add_argument("--photons", type=_positive, default=10000, help="number of input photons (default: 10000)")
+    _add_render(commands.add_parser("render", help="render a video with a trained method next to path tracing"))
+    select = commands.add_parser("select", help="find the smallest model that suffices for a scene, within minutes")
+    select.add_argument("--config", required=True, help="ladder in configs/select, by name or path")
+    select.add_argument("--minutes", type=float, help="time limit of measuring and training (default: the ladder's)")
+    select.add_argument("--out", help="directory for the results (default: results/select/NAME)")
     select.add_argument(
-        "--advice", action="store_true", help="only say what varies in the scene, and so what is needed; train nothing"
+        "--advice", action="store_true", help="report what varies in the scene and what a model needs; train nothing"
     )
-    report = commands.add_parser("report", help="draw tables, figures and report.html of results anew, on any machine")
-    report.add_argument("--megabytes", type=_positive, help="of report.html, at most: fewer images (default: 25)")
-    board = commands.add_parser("dashboard", help="show a comparison's trainings and results in TensorBoard")
-    board.add_argument("--port", type=_whole, default=6006, help="of the server (default: 6006; 0 takes a free one)")
+    report = commands.add_parser("report", help="redraw the tables, figures and report.html of results")
+    report.add_argument("--megabytes", type=_positive, help="maximum size of report.html (default: 25)")
+    board = commands.add_parser("dashboard", help="show a comparison's training runs and results in TensorBoard")
+    board.add_argument("--port", type=_whole, default=6006, help="server port (default: 6006; 0 takes a free port)")
     for command in (report, board):
-        command.add_argument("directory", help="of results, as nlt compare wrote them")
-    teachers = commands.add_parser("teachers", help="compare path and bdpt: variance at equal time, scene by scene")
-    _add_views(teachers, seconds=(60, "of rendering by each teacher"), resolution=(64, _SIDE), views=(4, _VIEWS))
+        command.add_argument("directory", help="results directory of nlt compare")
+    teachers = commands.add_parser("teachers", help="compare the integrators path and bdpt: variance at equal time")
+    _add_views(teachers, seconds=(60, "seconds of rendering per integrator"), resolution=(64, _SIDE), views=(4, _VIEWS))
     teachers.add_argument("--out", type=Path, default=Path("results/teachers"), help=_OUT.format("results/teachers"))
     _add_scenes(commands.add_parser("scenes", help="list, show, check, add or preview scenes"))
     return parser
 
 
 def _add_views(parser: argparse.ArgumentParser, **numbers: tuple[int, str]) -> None:
-    """Scenes, and what of them is rendered."""
-    parser.add_argument("names", nargs="+", help="descriptions of configs/scenes, by name or path")
+    """Add the scenes and the options of how to render them."""
+    parser.add_argument("names", nargs="+", help="scene descriptions in configs/scenes, by name or path")
     for name, (default, text) in numbers.items():
         parser.add_argument(f"--{name}", type=_positive, default=default, help=f"{text} (default: {default})")
     parser.add_argument(
         "--experiment", type=_experiment, default="fixed_lights",
         help="static, fixed_lights or moving_lights (default: fixed_lights)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=_whole, default=0, help="of states, views and noise (default: 0)")
+    parser.add_argument("--seed", type=_whole, default=0, help="seed of states, views and noise (default: 0)")
 
 
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
@@ -282,7 +284,7 @@ def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
     parser.add_argument(
         "--scheduler",
         default="local",
-        help="local, slurm, or a Dask scheduler such as tcp://host:8786 (default: local)",
+        help="local, slurm or a Dask scheduler, for example tcp://host:8786 (default: local)",
     )
     parser.add_argument(
         "--slurm",
@@ -290,59 +292,59 @@ def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
         type=_pair,
         default=[],
         metavar="KEY=VALUE",
-        help="an option of sbatch, such as time=60",
+        help="option of sbatch, for example time=60",
     )
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", default="demo", help="of configs/data, by name or path (default: demo)")
-    parser.add_argument("--scale", default="demo", help="of configs/scale, by name or path (default: demo)")
-    parser.add_argument("--methods", nargs="+", help="of configs/model (default: all)")
+    parser.add_argument("--data", default="demo", help="config in configs/data, by name or path (default: demo)")
+    parser.add_argument("--scale", default="demo", help="config in configs/scale, by name or path (default: demo)")
+    parser.add_argument("--methods", nargs="+", help="configs in configs/model (default: all)")
     parser.add_argument(
         "--set", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
-        help="over the configs: resolution, points, photons, width, depth, batch_size, workers; batch: frames at once",
+        help="override resolution, points, photons, width, depth, batch_size, workers or batch (frames at a time)",
     )  # fmt: skip
-    parser.add_argument("--ckpt", help="a checkpoint of the one method (default: random weights)")
-    parser.add_argument("--device", help="cpu or cuda (default: cuda, if there is one)")
-    parser.add_argument("--seconds", type=_positive, default=20, help="the most that a measurement takes (default: 20)")
+    parser.add_argument("--ckpt", help="checkpoint of the only method (default: random weights)")
+    parser.add_argument("--device", help="cpu or cuda (default: cuda if available)")
+    parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
     parser.add_argument(
         "--growth", nargs="*", metavar="METHOD",
-        help="also measure over resolution, points, photons, width and batch (without a name: nlt_photons)",
+        help="also vary resolution, points, photons, width and batch (without METHOD: of nlt_photons)",
     )  # fmt: skip
     parser.add_argument("--out", default="results/bench", help=_OUT.format("results/bench"))
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="of nlt fit, or NAME.safetensors of nlt export")
-    parser.add_argument("scene", nargs="?", metavar="SCENE", help="a description of configs/scenes, by name or path")
-    parser.add_argument("--demo", action="store_true", help="take the model that comes with nlt, and move the light")
-    parser.add_argument("--state", default="0", help="the number of a random state, or a YAML file (default: 0)")
-    parser.add_argument("--light", choices=("turntable",), help="moves around (default: as --state says)")
+    parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="checkpoint, or NAME.safetensors from nlt export")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="description in configs/scenes, by name or path")
+    parser.add_argument("--demo", action="store_true", help="use the model that comes with nlt and move the light")
+    parser.add_argument("--state", default="0", help="index of a random state, or a YAML file (default: 0)")
+    parser.add_argument("--light", choices=("turntable",), help="move the light around (default: as in --state)")
     parser.add_argument(
-        "--camera-path", default="turntable", help="turntable, or a YAML or JSON file of views (default: turntable)"
+        "--camera-path", default="turntable", help="turntable, or a YAML or JSON file with views (default: turntable)"
     )
-    parser.add_argument("-o", "--output", default="video.mp4", help="NAME.mp4 or a folder (default: video.mp4)")
-    for option, default in (("--frames", 36), ("--fps", 24)):
-        parser.add_argument(option, type=_positive, default=default, help=f"(default: {default})")
-    parser.add_argument("--resolution", type=_size, default=(256, 256), help="N or WIDTHxHEIGHT (default: 256)")
+    parser.add_argument("-o", "--output", default="video.mp4", help="NAME.mp4 or a frame folder (default: video.mp4)")
+    for option, default, text in (("--frames", 36, "number of frames"), ("--fps", 24, "frames per second")):
+        parser.add_argument(option, type=_positive, default=default, help=f"{text} (default: {default})")
+    parser.add_argument("--resolution", type=_size, default=(256, 256), help="N or WIDTHxHEIGHT, pixels (default: 256)")
     parser.add_argument(
-        "--spp", type=_spp, help="of path tracing beside it; 0 for none (default: equal, what takes as long)"
+        "--spp", type=_spp, help="samples per pixel of path tracing; 0 omits it (default: equal, at equal time)"
     )
-    parser.add_argument("--photons", type=_positive, help="to cast (default: as the method was trained with)")
+    parser.add_argument("--photons", type=_positive, help="number of input photons (default: as in training)")
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
-    actions.add_parser("list", help="list the descriptions of configs/scenes")
-    show = actions.add_parser("show", help="say what a description and its scene hold")
-    show.add_argument("name", help="of a description of configs/scenes, or a path")
-    check = actions.add_parser("check", help="load a scene file; say what it has, what it lacks, what to make of it")
-    add = actions.add_parser("add", help="measure a scene file and write a description of it, to edit")
+    actions.add_parser("list", help="list the scene descriptions in configs/scenes")
+    show = actions.add_parser("show", help="show the content of a scene description and its scene")
+    show.add_argument("name", help="scene description in configs/scenes, by name or path")
+    check = actions.add_parser("check", help="load a scene file and report its content, problems and description")
+    add = actions.add_parser("add", help="measure a scene file and write a scene description that you can edit")
     for action in (check, add):
         action.add_argument("file", type=Path, help="Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ")
-    add.add_argument("--name", help="of the scene (default: the file's, or its folder's for scene.xml)")
+    add.add_argument("--name", help="name of the scene (default: the file's name, or its folder's for scene.xml)")
     add.add_argument("-o", "--output", type=Path, help="file to write (default: configs/scenes/NAME.yaml)")
-    preview = actions.add_parser("preview", help="draw a contact sheet: a row per scene, random views of random states")
+    preview = actions.add_parser("preview", help="draw a contact sheet with one row of random views per scene")
     preview.add_argument("-o", "--output", type=_picture, default="preview.png", help=_IMAGE.format("preview.png"))
     _add_views(preview, views=(4, _VIEWS), resolution=(256, _SIDE), spp=(64, "samples per pixel"))
 
@@ -350,14 +352,14 @@ def _add_scenes(parser: argparse.ArgumentParser) -> None:
 def _add_data(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
     show = actions.add_parser("show", help="draw the twelve components of a sample")
-    show.add_argument("--split", choices=("val", "test"), default="test", help="of the sample (default: test)")
-    show.add_argument("--index", type=_whole, default=0, help="of the sample in its split (default: 0)")
+    show.add_argument("--split", choices=("val", "test"), default="test", help="split of the sample (default: test)")
+    show.add_argument("--index", type=_whole, default=0, help="index of the sample in its split (default: 0)")
     show.add_argument("-o", "--output", type=_picture, default="sample.png", help=_IMAGE.format("sample.png"))
-    verify = actions.add_parser("verify", help="read every byte and say all that is wrong")
+    verify = actions.add_parser("verify", help="read every byte and report everything that is wrong")
     stats = actions.add_parser("stats", help="measure bytes and seconds by field, here and at the paper's scale")
-    stats.add_argument("--workers", type=_positive, help="processes side by side (default: as many as cores)")
+    stats.add_argument("--workers", type=_positive, help="concurrent processes (default: available CPUs)")
     for action in (show, verify, stats):
-        action.add_argument("dataset", help="directory or URL, as nlt generate prints it")
+        action.add_argument("dataset", help="directory or URL that nlt generate prints")
 
 
 def _run_data(options: argparse.Namespace) -> None:

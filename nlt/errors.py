@@ -1,14 +1,14 @@
-"""The one exception for a user's mistake: the command line prints it as one line and exits with 2."""
+"""Errors caused by the user: the command line prints one line and exits with code 2."""
 
 
 class UserError(Exception):
-    """Bad input. The message names the file, the field and the remedy, in one line."""
+    """Invalid input. The message names the file, the field and the remedy in one line."""
 
 
 class DivergedError(UserError):
-    """A training whose loss, or a method whose prediction, is not finite."""
+    """The loss of a training run or the prediction of a method is not finite."""
 
 
 def to_user_error(error: OSError) -> UserError:
-    """No space, no permission and the like: what is written stays."""
-    return UserError(f"{error.filename or 'nlt'}: {error.strerror or error}; set it right and run again")
+    """Convert an operating-system error, for example a full disk, to a user error in one line."""
+    return UserError(f"{error.filename or 'nlt'}: {error.strerror or error}; fix this and run the command again")

@@ -27,7 +27,7 @@ from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
 
-# Advice for other set-ups than ours; what it says is either decided on purpose or untrue here.
+# Advice for other set-ups: it contradicts deliberate choices or does not apply here.
 _NOISE = (
     ".*does not have many workers.*",
     ".*LeafSpec.*",
@@ -38,18 +38,21 @@ _NOISE = (
     ".*callbacks used to create the checkpoint need to be provided.*",
     ".*Checkpoint directory .* exists and is not empty.*",
 )
-# Checkpoints that Lightning finds by itself.
-_LIGHTNINGS_OWN = ("best", "last", "hpc")
+# Names of checkpoints that Lightning finds by itself.
+_LIGHTNING_CHECKPOINTS = ("best", "last", "hpc")
 
 
 class Checkpoints(ModelCheckpoint):
-    """The last finished epoch's checkpoint, and the one before until the new one is written whole."""
+    """Saves the last finished epoch's checkpoint and keeps the previous one until the new one is complete."""
 
     def __init__(self) -> None:
         super().__init__(filename="{epoch}-{step}", save_top_k=1, save_on_train_epoch_end=True)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Resuming with max_steps, Lightning would end the last epoch anew, on a batch more: as with max_epochs."""
+        """Mark the last epoch as completed when a run resumes with max_steps, as Lightning does with max_epochs.
+
+        Otherwise Lightning would end that epoch a second time, after one more batch.
+        """
         super().on_train_start(trainer, pl_module)
         loop: Any = trainer.fit_loop
         if loop.restarted_on_epoch_end:
@@ -60,7 +63,7 @@ class Checkpoints(ModelCheckpoint):
 
 
 class Predictions(BasePredictionWriter):
-    """`nlt predict`: every predicted image as displayed, in the run's directory predictions/, by sample index."""
+    """Writes the images of `nlt predict` as displayed to predictions/ in the run's directory, by sample index."""
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
@@ -82,28 +85,28 @@ class Predictions(BasePredictionWriter):
 
 
 class NLTCLI(LightningCLI):
-    """LightningCLI in subclass mode: one DataModule, any method."""
+    """LightningCLI in subclass mode, for one DataModule and any method."""
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         for name in ("num_scenes", "num_points"):
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
 
     def _parse_ckpt_path(self) -> None:
-        """Not Lightning's: that would silently replace the config's model by the checkpoint's."""
+        """Check the checkpoint; Lightning's version would silently replace the config's model by the checkpoint's."""
         command = self.config.subcommand
         path = self.config[command].get("ckpt_path")
         if path is None and command != "fit":
-            raise UserError(f"--ckpt_path: missing; nlt {command} needs a checkpoint of nlt fit")
-        if path and path not in _LIGHTNINGS_OWN:
+            raise UserError(f"--ckpt_path: missing; nlt {command} needs a checkpoint from nlt fit")
+        if path and path not in _LIGHTNING_CHECKPOINTS:
             try:
                 read_checkpoint(path)
             except OSError as error:
                 raise UserError(f"--ckpt_path: {path}: cannot be read: {error.strerror}") from None
-            except Exception:  # whatever a damaged file makes the unpickler raise
+            except Exception:  # a damaged file can make the unpickler raise anything
                 raise UserError(f"--ckpt_path: {path}: not a checkpoint, or damaged; give another one") from None
 
     def instantiate_classes(self) -> None:
-        """Lightning's, refusals of a model or the trainer said as a user's mistake."""
+        """Instantiate the classes and report errors of the model or trainer as user errors."""
         try:
             super().instantiate_classes()
         except (ValueError, MisconfigurationException) as error:
@@ -111,15 +114,15 @@ class NLTCLI(LightningCLI):
 
 
 def quiet() -> None:
-    """Lightning says what is wrong, and no more."""
+    """Silence all messages of Lightning except relevant warnings and errors."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     for pattern in _NOISE:
         warnings.filterwarnings("ignore", pattern)
 
 
-class _Parser(NLTCLI):
-    """Parses a config, and makes nothing of it."""
+class _ConfigChecker(NLTCLI):
+    """Parses a config without instantiating anything."""
 
     def _set_seed(self) -> None: ...
 
@@ -129,13 +132,17 @@ class _Parser(NLTCLI):
 
 
 def check_configs(files: list[str]) -> None:
-    """Raises UserError if `nlt fit` would not take these configs: for a key or a type, before anything is made."""
+    """Check that `nlt fit` accepts the keys and types in these configs, without instantiating anything.
+
+    Raises:
+        UserError: a key is unknown or a value has the wrong type.
+    """
     arguments = ["fit", *(f"--config={file}" for file in files)]
-    _run(_Parser, arguments[1:], _sources(arguments), run=False)
+    _run(_ConfigChecker, arguments[1:], _sources(arguments), run=False)
 
 
 def run_lightning(arguments: list[str], callbacks: Sequence[L.Callback] = ()) -> NLTCLI:
-    """Run a subcommand such as `fit --config ...` and return what it made.
+    """Run a subcommand, for example `fit --config ...`, and return its LightningCLI.
 
     Raises:
         UserError: a config, a checkpoint or the dataset is wrong.
@@ -146,7 +153,7 @@ def run_lightning(arguments: list[str], callbacks: Sequence[L.Callback] = ()) ->
 def _run(
     kind: type[NLTCLI],
     arguments: list[str],
-    given: dict[str, str],
+    sources: dict[str, str],
     callbacks: Sequence[L.Callback] = (),
     run: bool = True,
 ) -> NLTCLI:
@@ -157,7 +164,7 @@ def _run(
             LightTransportDataModule,
             subclass_mode_model=True,
             seed_everything_default=0,
-            # The samplers are ours: Lightning's would repeat samples at evaluation.
+            # These disable Lightning's samplers, which would repeat samples in evaluation.
             trainer_defaults=trainer_defaults(callbacks),
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"exit_on_error": False},
@@ -165,16 +172,16 @@ def _run(
             run=run,
         )
     except ArgumentError as error:
-        raise UserError(_with_place(str(error), given, arguments[0] if run else "fit")) from None
-    except UserError as error:  # one from a loader process comes with that process's traceback
+        raise UserError(_with_source(str(error), sources, arguments[0] if run else "fit")) from None
+    except UserError as error:  # an error from a loader process contains its traceback
         raise type(error)(str(error).rpartition("UserError: ")[2].strip()) from None
 
 
 def _sources(arguments: list[str]) -> dict[str, str]:
-    """What settings come from: --config files, once they can be read, and other arguments, with their text.
+    """Return the text of every source of settings: the --config files and the other arguments.
 
     Raises:
-        UserError: a file cannot be read, or settings of a model come before the model.
+        UserError: a file cannot be read, or has settings of a model that no config has chosen yet.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-c", "--config", action="append", nargs="?", default=[])
@@ -185,29 +192,29 @@ def _sources(arguments: list[str]) -> dict[str, str]:
         model = read_configs([file]).get("model")
         known = known or (isinstance(model, Mapping) and "class_path" in model)
         if model and not known:
-            raise UserError(f"{file}: model.class_path: missing; give a --config of configs/model before this one")
+            raise UserError(f"{file}: model.class_path: missing; give a --config from configs/model before this one")
     return {file: Path(file).read_text() for file in files} | {argument: argument for argument in rest}
 
 
 def _one_line(message: str) -> str:
-    """jsonargparse's or Lightning's message, without the alternatives that were not meant."""
+    """Return a message of jsonargparse or Lightning in one line, without the alternatives that were not meant."""
     message = " ".join(message.split())
     message = re.sub(r"Group '([\w.]+)' does not accept option '(\w+)'", r"Option '\1.\2' is not accepted", message)
     return re.sub(r"Does not validate .*? Errors: - (.*?) - Expected a <class 'NoneType'>.*", r"\1", message)
 
 
-def _with_place(message: str, given: dict[str, str], command: str) -> str:
-    """jsonargparse's message as one line, headed by the files or arguments it is about."""
+def _with_source(message: str, sources: dict[str, str], command: str) -> str:
+    """Return jsonargparse's message in one line that begins with the files or arguments that it is about."""
     message = _one_line(message)
     keys = re.findall(r"""(?:[Oo]ption|Parser key) ['"]([\w.]+)['"]""", message)
     words = keys[-1].split(".") if keys else []
-    about = [name for name, text in given.items() if all(re.search(rf"\b{word}\b", text) for word in words)]
-    place = " + ".join(about or given) or f"nlt {command}"
+    matching = [name for name, text in sources.items() if all(re.search(rf"\b{word}\b", text) for word in words)]
+    place = " + ".join(matching or sources) or f"nlt {command}"
     return f"{place}: {message}; see nlt {command} --help"
 
 
 def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:
-    """What the trainer does unless a config says otherwise."""
+    """Return the trainer's settings, which configs can override."""
     return {
         "precision": Policy.for_device(default_device()).precision,
         "use_distributed_sampler": False,
@@ -224,16 +231,16 @@ def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint, without running any code that it may hold. A file that is none raises anything."""
+    """Load a checkpoint without running code from it; a file that is not one can raise any exception."""
     checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     return dict(checkpoint)
 
 
 def load_method(path: str, place: str, device: torch.device | str = "cpu") -> RenderingModule:
-    """The method of a checkpoint; `place` is what asks for it, such as an option.
+    """Load the method of a checkpoint; `place`, for example an option, begins the error messages.
 
     Raises:
-        UserError: it cannot be read, or is none.
+        UserError: the file cannot be read or is not a checkpoint.
     """
     try:
         return RenderingModule.load_from_checkpoint(path, map_location=device)
@@ -241,13 +248,13 @@ def load_method(path: str, place: str, device: torch.device | str = "cpu") -> Re
         raise UserError(f"{place}: {path}: cannot be read: {error.strerror}") from None
     except UserError:
         raise
-    except Exception:  # whatever a damaged file makes the unpickler raise
+    except Exception:  # a damaged file can make the unpickler raise anything
         raise UserError(f"{place}: {path}: not a checkpoint, or damaged; give another one") from None
 
 
 def newest_checkpoint(run: Path) -> Path | None:
-    """The latest checkpoint of a run that can be read: one that was being written at a kill -9 is passed over."""
+    """Return a run's latest complete checkpoint, or None; one that a killed process left unfinished is skipped."""
     for path in sorted(run.glob("checkpoints/*.ckpt"), key=lambda p: p.stat().st_mtime, reverse=True):
-        if is_zipfile(path):  # its directory is written last, so nothing need be read
+        if is_zipfile(path):  # a zip file's directory is written last
             return path
     return None

@@ -1,8 +1,8 @@
-"""How PyTorch's threads wait for one another. OpenMP reads it once, so it is set before torch is imported.
+"""The wait policy of PyTorch's OpenMP threads. OpenMP reads it once, so it must be set before torch is imported.
 
-In a frame Mitsuba's threads and PyTorch's take turns on the same cores, and there whoever spins while waiting keeps the
-others from their work: passively, a frame at 64x64 takes two thirds of the time. A training is alone on its cores, and
-faster if it spins (docs/performance.md).
+While a frame is rendered, Mitsuba's and PyTorch's threads alternate on the same cores, and a thread that spins while it
+waits slows down the others: with the passive policy, a frame at 64x64 takes two thirds of the time. A training run does
+not share its cores and is faster with spinning threads (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 WAIT_POLICY = "OMP_WAIT_POLICY"
-_ours = False
+_ours = False  # whether `wait_passively` set the policy
 
 
 def wait_passively() -> None:
-    """For this process, unless the user's environment says otherwise."""
+    """Set the passive policy for this process, unless the user's environment already sets a policy."""
     global _ours
     if WAIT_POLICY not in os.environ:
         os.environ[WAIT_POLICY], _ours = "passive", True
@@ -24,10 +24,10 @@ def wait_passively() -> None:
 
 @contextmanager
 def as_the_user_said() -> Iterator[None]:
-    """Processes that are started within do not inherit what `wait_passively` set."""
-    kept = os.environ.pop(WAIT_POLICY, None) if _ours else None
+    """Prevent processes started in this context from inheriting the policy that `wait_passively` set."""
+    policy = os.environ.pop(WAIT_POLICY, None) if _ours else None
     try:
         yield
     finally:
-        if kept is not None:
-            os.environ[WAIT_POLICY] = kept
+        if policy is not None:
+            os.environ[WAIT_POLICY] = policy

@@ -1,7 +1,7 @@
-"""What the paper's scale would cost, from measured rates: `python scripts/paper_scale.py [results/bench/NAME]`.
+"""Estimates the cost of the paper's scale from measured rates: `python scripts/paper_scale.py [results/bench/NAME]`.
 
-Everything but the prices and a GPU's rate, which are assumed and said to be, is read from `nlt bench`'s results and the
-configs. Prints the tables of docs/cluster.md.
+Everything is read from `nlt bench`'s results and the configs, except the prices and a GPU's rate, which are assumed and
+marked as such. Prints the tables of docs/cluster.md.
 """
 
 import json
@@ -11,9 +11,9 @@ from pathlib import Path
 from nlt.data.spec import load_spec, read_configs
 from nlt.paths import PROJECT, find_config
 
-METHODS = 9  # of the paper's Table 2
+METHODS = 9  # in the paper's Table 2
 CORE_HOUR, GPU_HOUR = 0.04, 3.0  # dollars, assumed
-TFLOPS = (20, 100)  # that one GPU may sustain, assumed
+TFLOPS = (20, 100)  # sustained by one GPU, assumed
 BACKWARD = 3  # a training step's work, in forward passes
 
 
@@ -24,7 +24,7 @@ def _rates(bench: Path) -> tuple[dict, dict, dict, dict]:
 
 
 def tables(bench: Path) -> str:
-    """The measured rates, and what they make of the paper's Table 2, as Markdown."""
+    """Return the measured rates and the cost of the paper's Table 2 at these rates, as Markdown."""
     manifest, generation, training, frame = _rates(bench)
     files = [str(find_config("data", "dynamic_moving_lights")), str(find_config("scale", "paper"))]
     (spec, _), scale = load_spec(files), read_configs(files)

@@ -1,4 +1,4 @@
-"""Make the model of `nlt render --demo` from a finished training: safetensors, and a manifest of where it is from.
+"""Make the model of `nlt render --demo` from a finished training: safetensors, and a manifest of its origin.
 
     nlt generate --config configs/data/demo.yaml --config configs/scale/pretrained.yaml
     nlt fit --config configs/data/demo.yaml --config configs/model/photon_splat.yaml \
@@ -24,7 +24,7 @@ CONFIGS = [f"configs/{name}.yaml" for name in ("data/demo", "model/photon_splat"
 
 
 def main(checkpoint: str, commit: str) -> None:
-    """Judge a checkpoint that was trained at `commit`, and write it to where `nlt render --demo` finds it."""
+    """Evaluate a checkpoint that was trained at `commit` and write it to where `nlt render --demo` finds it."""
     begun, configs = origin(), [f"--config={file}" for file in CONFIGS]
     run = read_configs([str(Path(checkpoint).absolute().parents[1] / "config.yaml")])
     trainer = run_lightning(["test", *configs, f"--ckpt_path={checkpoint}", "--trainer.logger=false"]).trainer

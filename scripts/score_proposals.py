@@ -1,4 +1,4 @@
-"""How many of the objects that people marked in the real rooms `nlt scenes add` proposes: a row per room."""
+"""Count how many of the objects that people marked in the real rooms `nlt scenes add` proposes: a row per room."""
 
 import json
 import multiprocessing
@@ -10,7 +10,10 @@ from nlt.rendering.variant import use_variant
 
 
 def score(folder: Path) -> str:
-    """A proposal is right if it shares at least half of the marked object's surface, and exact if all of it."""
+    """Return a room's row: an object is found if a proposal overlaps half of its surface, exact if all of it.
+
+    The overlap is intersection over union of the surface areas.
+    """
     use_variant()
     from nlt.scenes import importer
     from nlt.scenes.assembly import read_shape
@@ -23,8 +26,8 @@ def score(folder: Path) -> str:
     marked = [set(o["shapes"]) for o in json.loads((folder / "objects.json").read_text())["objects"].values()]
     total = lambda names: sum(area[n] for n in names)
     best = [max((total(m & p) / total(m | p) for p in proposed), default=0.0) for m in marked]
-    found, exact = sum(b >= 0.5 for b in best), sum(b > 0.99 for b in best)
-    return f"| {folder.name} | {len(marked)} | {found} | {exact} | {len(proposed)} |"
+    overlapping, exact = sum(b >= 0.5 for b in best), sum(b > 0.99 for b in best)
+    return f"| {folder.name} | {len(marked)} | {overlapping} | {exact} | {len(proposed)} |"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The README's pictures of the report and the dashboard: `python scripts/screenshots.py results/NAME [docs]`.
+"""Take the README's pictures of the report and the dashboard: `python scripts/screenshots.py results/NAME [docs]`.
 
 Writes report.png (the image viewer) and dashboard.png into the second directory. Needs playwright and chromium
-(`scripts/system-packages.sh chromium`), and the results' images; the trainings' curves are shown where runs/ has them.
+(`scripts/system-packages.sh chromium`), and the results' images; the dashboard shows the curves that runs/ has.
 """
 
 import os
@@ -19,14 +19,14 @@ from nlt.report.page import PAGE
 
 
 def report(page: Page, directory: Path, path: Path) -> None:
-    """The viewer with the slider between its first choice of images, and what is beside and below it."""
+    """Capture the viewer, with the slider between its first two images, and the controls around it."""
     page.goto((directory / PAGE).resolve().as_uri())
     page.wait_for_function("$('canvas').dataset.drawn === JSON.stringify(state)")
     page.locator("#viewer").screenshot(path=path)
 
 
 def dashboard(page: Page, directory: Path, path: Path) -> None:
-    """TensorBoard's custom scalars: the training and validation curves of all methods."""
+    """Capture TensorBoard's custom scalars: the training and validation curves of all methods."""
     board = program.TensorBoard()
     board.configure(logdir=str(write_logs(load(directory))), port=0)
     page.goto(f"{board.launch()}/#custom_scalars")

@@ -1,7 +1,7 @@
-"""Copies what the documentation shows out of results/ and the code: `python scripts/update_readme.py`.
+"""Update the documentation's copies of results and of the code's tables: `python scripts/update_readme.py`.
 
-A block between `<!-- SOURCE -->` and `<!-- end -->` is made anew, where SOURCE is a table of results
-(`results/NAME/table.md`, of which the first is shown), another page of results (shown whole, such as
+Each block between `<!-- SOURCE -->` and `<!-- end -->` is generated again. SOURCE is a table of results
+(`results/NAME/table.md`, whose first table is shown), another page of results (shown whole, for example
 `results/NAME/stress/stress.md`), a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
 """
 
@@ -16,7 +16,7 @@ PAGES = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 
 
 def content(source: str) -> str:
-    """What belongs into a block."""
+    """Return the content of a block."""
     path, _, name = source.partition(" ")
     if path == "nlt/data/sample.py":
         return field_table(getattr(sample, name))
@@ -26,14 +26,14 @@ def content(source: str) -> str:
 
 
 def body(path: Path) -> str:
-    """A Markdown file without its title, a level lower; that it is not there, where it is not."""
+    """Return a Markdown file without its title, a level lower, or a note that the file does not exist yet."""
     if not path.exists():
         return f"Not measured yet: there is no {path.relative_to(PROJECT)}."
     return re.sub(r"^#", "##", path.read_text().partition("\n")[2].strip(), flags=re.MULTILINE)
 
 
 def first_table(path: Path) -> str:
-    """The first table of a Markdown file."""
+    """Return the first table of a Markdown file."""
     lines = path.read_text().splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith("|"))
     stop = next(k for k in range(start, len(lines)) if not lines[k].startswith("|"))
@@ -41,7 +41,7 @@ def first_table(path: Path) -> str:
 
 
 def field_table(fields: dict[str, sample.Field]) -> str:
-    """A row per field of a sample."""
+    """Return a Markdown table with a row per field of a sample."""
     rows = ["| field | shape | dtype | unit | meaning |", "|---|---|---|---|---|"]
     for name, f in fields.items():
         star, shape = " *" * f.reference_only, ", ".join(map(str, f.shape))
@@ -50,7 +50,7 @@ def field_table(fields: dict[str, sample.Field]) -> str:
 
 
 def update(text: str) -> str:
-    """The text with every block made anew."""
+    """Return the text with every block generated again."""
     block = re.compile(r"<!-- (results/\S+\.md|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
     return block.sub(lambda m: f"<!-- {m[1]} -->\n{content(m[1])}\n<!-- end -->", text)
 

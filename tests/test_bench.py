@@ -203,7 +203,7 @@ def test_what_would_take_too_long_is_skipped_and_said(arguments, tmp_path, monke
     skipped = run.measure(part, done)["skipped"]
     assert "1.2 s" in skipped and "1 s" in skipped
     assert run.measure(bench.Part("growth", "cnn", "width", 8), done | {part.key: {"skipped": skipped}}) == {
-        "skipped": "so was width 4"
+        "skipped": "width 4 was skipped"
     }
     done = {bench.Part("growth", "cnn", "width", 2).key: {"time_per_frame_s": 0.0, "peak_memory_bytes": 2**60}}
     assert "GiB" in run.measure(part, done)["skipped"]

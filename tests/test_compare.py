@@ -150,7 +150,7 @@ def world(tiny, tmp_path_factory, one_thread):
         patch.chdir(folder)
         patch.syspath_prepend(folder)
         patch.setattr(paths, "CONFIGS", folder / "configs")
-        patch.setattr(engines, "cores", lambda: 1)  # and so many threads in a training's process
+        patch.setattr(engines, "available_cpus", lambda: 1)  # and so many threads in a training's process
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
         patch.setattr(clock.Clock, "_frame", spy)
@@ -302,7 +302,7 @@ def test_the_papers_figures_stand_beside_ours(world):
 
 def test_pictures(world):
     """A row per view, a column per method between the noisy image and the reference; nothing is black."""
-    image = np.asarray(Image.open(world.folder / "out/samples.png").convert("RGB")) / 255
+    image = np.asarray(Image.open(world.folder / "out/samples.webp").convert("RGB")) / 255
     columns, views, title = len(world.rows) + 2, 3, int(0.35 * 100)
     height, width = (image.shape[0] - title) / views, image.shape[1] / columns
     dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test", ())
@@ -603,7 +603,7 @@ def test_training_images(world, trainings, capfd):
     assert rows[0]["mse"] == float(world.rows["cnn"]["mse"]) != rows[1]["mse"] > 0
     assert trainings[0].took["steps"] == STEPS and (world.folder / "fewer/table.csv").read_text().count("\ncnn,") == 1
     assert main(["compare", "--config", str(world.config), "--methods", "cnn", "--train-images", "9"]) == 2
-    assert "--train-images: 9 is more than data.dataset.train, 8" in capfd.readouterr().err
+    assert "--train-images: 9 is more than data.dataset.train; give at most 8" in capfd.readouterr().err
 
 
 def test_curves_of_denoising(tmp_path):
@@ -801,7 +801,7 @@ def test_drawing_again_changes_no_byte(made, tmp_path):
 def test_without_images_the_rest_is_drawn(made, tmp_path):
     copy = shutil.copytree(made.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("images", "*.png"))
     assert main(["report", str(copy)]) == 0
-    assert (copy / "speed_accuracy.png").exists() and not (copy / "samples.png").exists()
+    assert (copy / "speed_accuracy.png").exists() and not (copy / "samples.webp").exists()
 
 
 @pytest.mark.parametrize(("file", "content"), [("manifest.json", None), ("runs.csv", None), ("manifest.json", "{")])

@@ -429,7 +429,7 @@ def test_files_that_nobody_sees(tmp_path, monkeypatch):
     """Workers that write to a disk of their own."""
     monkeypatch.setattr(generation, "_render", _writes_nothing)
     monkeypatch.setattr(generation, "_announce", lambda *_: None)
-    with pytest.raises(UserError, match=r"still without .*do all machines see this directory"):
+    with pytest.raises(UserError, match=r"is still missing; check that all machines see this directory"):
         generate(spec_of(), tmp_path, workers=1)
 
 

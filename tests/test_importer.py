@@ -133,7 +133,7 @@ def under_white_sky(scene, x=0.0, y=0.0):
 def test_old_dialect_renders_as_its_twin(folder):
     old = importer.read(write(folder / "old.xml", OLD))
     assert [s.id() for s in old.scene.shapes()] == ["Mesh001", "Quad", "Quad_2"]
-    assert old.warnings == ("ext_eta of roughconductor is left out: Mitsuba 3 takes air",)
+    assert old.warnings == ("ext_eta of roughconductor is ignored: Mitsuba 3 assumes air",)
     assert old.up == "y"
     np.testing.assert_allclose(old.camera[:3, 3], [0, 1, 3], atol=1e-6)
     twin = write(folder / "twin.xml", TWIN)
@@ -151,9 +151,7 @@ def test_every_missing_file_is_named(folder):
     (folder / "textures" / "sky.exr").unlink()
     (folder / "models" / "Mesh001.obj").unlink()
     path = write(folder / "old.xml", OLD.replace("</scene>", '<include filename="more.xml"/></scene>'))
-    refused(
-        lambda: importer.load(path), path, "missing: models/Mesh001.obj, more.xml, textures/sky.exr; put them there"
-    )
+    refused(lambda: importer.load(path), path, "missing: models/Mesh001.obj, more.xml, textures/sky.exr; add them")
 
 
 @pytest.mark.parametrize(
@@ -452,7 +450,7 @@ def test_check_and_add(tmp_path, capsys):
     assert main(["scenes", "show", str(file)]) == 0
     assert "movable objects: 3" in capsys.readouterr().out
     assert main(["scenes", "add", str(path), "-o", str(file)]) == 2
-    assert f"{file}: is there already" in capsys.readouterr().err
+    assert f"{file}: already exists" in capsys.readouterr().err
 
 
 def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):

@@ -203,7 +203,7 @@ def test_failures_are_those_of_the_file(stored):
 
 
 def test_the_teacher_is_named(stored):
-    note = "denoising's input: traced by bdpt in egg."
+    note = "inputs of OIDN and denoising are rendered with bdpt in egg."
     assert note in (stored / "table.md").read_text() and "kitchen" not in (stored / "table.md").read_text()
     assert html.unescape((stored / "report.html").read_text()).count(note) == 1
 

@@ -364,7 +364,7 @@ def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
     """Where nothing moves, a CNN is among those trained longest, though it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
-    score, race = trials.Trials.score, clock.Clock.race
+    score, race = trials.Trials.score, clock.Clock.time_interleaved
     worse = lambda this, candidate, *how: {
         key: [value + 9 * (candidate.method == "cnn") * (-1) ** (key == "mssim") for value in values]
         for key, values in score(this, candidate, *how).items()
@@ -417,7 +417,7 @@ def test_budget(space, monkeypatch, capsys, slower):
         ({"methods": ["oidn_1"]}, "methods: oidn_1 is not trained"),
         ({"points": [65]}, "points: 65 is more than the 64"),
         ({"photons": [0]}, "photons: must be at least 1"),
-        ({"photons": [8, 8]}, "photons: has one twice"),
+        ({"photons": [8, 8]}, "photons: must not have duplicates"),
         ({"minutes": 0}, "minutes: must be a number above 0"),
         ({"minutes": 1e-3}, "--minutes: 0.001 are too few"),
         ({"seeds": 0}, "seeds: must be a whole number"),

@@ -374,7 +374,7 @@ def test_rows(stressed):
             assert at["shifted"] == pytest.approx(at["views"], rel=1e-3)
     assert {path.name for path in stressed.directory.glob("*.*")} >= {
         "stress.csv", "training.csv", "breaking.csv", "stress.md", "manifest.json", "stress_curves.png",
-        "stress_map.png", "stress_worst.png",
+        "stress_map.png", "stress_worst.webp",
     }  # fmt: skip
 
 
@@ -410,7 +410,7 @@ def test_words(stressed):
 
 def test_again_changes_nothing(stressed, monkeypatch):
     """The second time nothing is rendered, trained or judged, and no byte of what is drawn changes."""
-    names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.png")
+    names = ("stress.csv", "training.csv", "breaking.csv", "stress.md", "stress_curves.svg", "stress_worst.webp")
     before = {name: (stressed.directory / name).read_bytes() for name in names}
     monkeypatch.setattr("nlt.stress.rendering.Local", None)
     monkeypatch.setattr("nlt.stress.views.SuiteViews.judge", None)

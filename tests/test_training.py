@@ -137,7 +137,7 @@ def test_embeddings_of_other_points_are_refused(tiny, checkpoint, tmp_path, capf
         capfd.readouterr()
         assert main(tiny.command(command, "nlt", *elsewhere, f"--ckpt_path={path}")) == 2
         error = capfd.readouterr().err
-        assert "other points than those that the checkpoint's embeddings are of" in error and str(directory) in error
+        assert "its points differ from those of the checkpoint's embeddings" in error and str(directory) in error
 
 
 def test_mixed_precision(tiny, tmp_path, monkeypatch):

@@ -1,1 +1,1 @@
-"""The baselines: each a file that says what it feeds the shared U-Net."""
+"""The baselines; each trained one is a file that defines the input of the shared U-Net."""

@@ -1,4 +1,4 @@
-"""The static ablation: any of four inputs, alone or together."""
+"""The static ablation: the U-Net with any combination of four inputs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INPUTS = ("position", "point_features", "normal", "ray_direction")
 
 
 class InputAblation(RenderingModule):
-    """Sec. "Ablation Study on Static Scene": the U-Net on any of the sixteen combinations, no light transport."""
+    """Sec. "Ablation Study on Static Scene": the U-Net on any combination of inputs, without light transport."""
 
     architecture = (*RenderingModule.architecture, "num_scenes", "num_points", *INPUTS, "embedding")
     stages = ("gbuffer",)
@@ -29,19 +29,19 @@ class InputAblation(RenderingModule):
         embedding: int = 64,
         **kwargs: Any,
     ) -> None:
-        """The base class takes the keyword arguments.
+        """The keyword arguments are those of the base class.
 
         Args:
-            position: projected point positions.
-            point_features: projected learned features of the points.
-            normal: the normal map.
-            ray_direction: the ray direction map.
+            position: use projected point positions.
+            point_features: use projected learned features of the points.
+            normal: use the normal map.
+            ray_direction: use the ray direction map.
             embedding: channels of the learned feature of each point.
         """
         super().__init__(**kwargs)
         hparams = self.hparams
         if not any(hparams[name] for name in INPUTS):
-            raise UserError(f"model.init_args: all of {', '.join(INPUTS)} are false; set one at least")
+            raise UserError(f"model.init_args: all of {', '.join(INPUTS)} are false; set at least one to true")
         if point_features:
             self.embedding = PointEmbedding(hparams["num_scenes"], hparams["num_points"], embedding)
 

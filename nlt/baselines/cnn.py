@@ -1,4 +1,4 @@
-"""Baseline "CNN only": the U-Net sees nothing but the G-buffer."""
+"""Baseline "CNN only": the U-Net sees only the G-buffer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule
 
 
 class CNN(RenderingModule):
-    """Sec. "Baselines" (1)."""
+    """Sec. "Baselines" (1): the U-Net on the G-buffer."""
 
     feature_channels = GBUFFER_CHANNELS
     inputs = GBUFFER

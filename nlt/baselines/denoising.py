@@ -11,7 +11,7 @@ from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule,
 
 
 def _hash(x: Tensor) -> Tensor:
-    """A bijective mix of 32-bit integers, held in int64: the same numbers on every device."""
+    """Mix 32-bit integers, held in int64, bijectively and equally on every device."""
     x = x & 0xFFFFFFFF
     for _ in range(2):
         x = ((x ^ (x >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
@@ -19,12 +19,12 @@ def _hash(x: Tensor) -> Tensor:
 
 
 def pixel_mask(seeds: Tensor, height: int, width: int, one_in: int) -> Tensor:
-    """A uniformly random subset of exactly round(height * width / one_in) pixels for each seed.
+    """Return a uniformly random subset of exactly round(height * width / one_in) pixels for each seed.
 
-    `seeds` (B,) int64; returns (B, 1, height, width) bool, which depends on nothing but the arguments.
+    `seeds` (B,) int64; returns (B, 1, height, width) bool, which depends only on the arguments.
     """
     pixels = height * width
-    # Bijective, so no two pixels of a sample draw the same number.
+    # The hash is bijective, so no two pixels of a sample have the same key.
     keys = _hash(_hash(torch.arange(pixels, device=seeds.device)) + _hash(seeds)[:, None])
     chosen = keys.argsort(dim=1)[:, : round(pixels / one_in)]
     mask = torch.zeros_like(keys, dtype=torch.bool).scatter_(1, chosen, True)
@@ -32,7 +32,7 @@ def pixel_mask(seeds: Tensor, height: int, width: int, one_in: int) -> Tensor:
 
 
 class SparseDenoising(RenderingModule):
-    """Sec. "Baselines" (2), similar to Lehtinen et al. 2018: 4 spp in 1 of `one_in` pixels, the rest 0.
+    """Sec. "Baselines" (2), similar to Lehtinen et al. 2018: 4 spp in 1 of `one_in` pixels, 0 in the others.
 
     The paper names noisy renderings as the only input, and its times and errors agree with that, so the G-buffer is
     left out by default.
@@ -41,11 +41,11 @@ class SparseDenoising(RenderingModule):
     architecture = (*RenderingModule.architecture, "one_in", "gbuffer")
 
     def __init__(self, one_in: int = 1, gbuffer: bool = False, **kwargs: Any) -> None:
-        """The base class takes the keyword arguments.
+        """The keyword arguments are those of the base class.
 
         Args:
-            one_in: one in how many pixels is path traced.
-            gbuffer: feed the G-buffer too, which makes it guided denoising.
+            one_in: path trace one in this many pixels.
+            gbuffer: also use the G-buffer, which makes it guided denoising.
         """
         super().__init__(**kwargs)
 
@@ -66,9 +66,9 @@ class SparseDenoising(RenderingModule):
         return 1 / self.hparams["one_in"]
 
     def mask(self, batch: Batch, height: int, width: int) -> Tensor:
-        """The pixels to trace (B, 1, height, width): fresh at each training step, else the sample's own."""
+        """Return the pixels to trace (B, 1, height, width): new at each training step, else fixed for each sample."""
         seeds = _hash(_hash(batch["scene"]) + batch["index"])
-        if self.training:  # a function of the step alone, not of a generator's state: resuming is exact
+        if self.training:  # from the step, not from a generator's state, so that resuming is exact
             seeds = _hash(_hash(seeds + self.global_step) + self.hparams["seed"])
         return pixel_mask(seeds, height, width, self.hparams["one_in"])
 

@@ -1,4 +1,4 @@
-"""Baseline "Feature Projection": learned point features projected as they are, without light transport."""
+"""Baseline "Feature Projection": learned point features are projected without light transport."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class FeatureProjection(RenderingModule):
     stages = ("gbuffer",)
 
     def __init__(self, embedding: int = 64, **kwargs: Any) -> None:
-        """The base class takes the keyword arguments.
+        """The keyword arguments are those of the base class.
 
         Args:
             embedding: channels of the learned feature of each point.

@@ -1,4 +1,4 @@
-"""What a user has without any learning of ours: path tracing alone, and Intel Open Image Denoise after it."""
+"""Methods that we do not train: path tracing, alone or denoised by Intel Open Image Denoise."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Quality = Literal["fast", "balanced", "high"]
 
 
 class PathTracing(Method):
-    """Every pixel at `spp` samples, and nothing after it."""
+    """Path tracing of every pixel at `spp` samples, without denoising."""
 
     inputs: tuple[str, ...] = ("traced",)
     stages: tuple[str, ...] = ("path_tracing",)
 
     def __init__(self, spp: int = 1) -> None:
-        """`spp`: samples per pixel."""
+        """Render at `spp` samples per pixel."""
         super().__init__()
         self._spp = spp
 
@@ -39,14 +39,14 @@ class PathTracing(Method):
 class OpenImageDenoise(PathTracing):
     """Path tracing at `spp`, denoised by OIDN's ray-tracing filter with albedo and normal (Áfra, Intel).
 
-    Both guides are free of noise and are given as such. The filter sees exposed radiance.
+    The filter is told that both guides are free of noise. It sees exposed radiance.
     """
 
     inputs = ("traced", "albedo", "normal")
     stages = ("gbuffer", "path_tracing")
 
     def __init__(self, spp: int = 1, quality: Quality = "high") -> None:
-        """`spp`: samples per pixel; `quality`: OIDN's mode, from the fastest to the slowest."""
+        """Denoise a rendering at `spp` samples per pixel; `quality` is OIDN's mode, from fastest to slowest."""
         super().__init__(spp)
         if quality not in get_args(Quality):
             raise UserError(f"model.init_args.quality: must be one of {', '.join(get_args(Quality))}, is {quality!r}")
@@ -59,15 +59,15 @@ class OpenImageDenoise(PathTracing):
         return self.denoise(batch)
 
     def denoise(self, batch: Batch, _: Any = None) -> Tensor:
-        """The denoised radiance (B, 3, H, W)."""
+        """Return the denoised radiance (B, 3, H, W)."""
         import mitsuba_oidn as oidn
 
         exposure = batch["exposure"].view(-1, 1, 1, 1)
         images = (batch["traced"] * exposure, batch["albedo"], batch["normal"])
-        last = [image.permute(0, 2, 3, 1).float().contiguous() for image in images]
-        how = {"hdr": True, "clean_aux": True, "quality": oidn.Quality[self._quality.capitalize()]}
+        channels_last = [image.permute(0, 2, 3, 1).float().contiguous() for image in images]
+        options = {"hdr": True, "clean_aux": True, "quality": oidn.Quality[self._quality.capitalize()]}
         denoised = [
-            torch.from_dlpack(oidn.denoise(colour, albedo=albedo, normal=normal, **how))
-            for colour, albedo, normal in zip(*last, strict=True)
+            torch.from_dlpack(oidn.denoise(colour, albedo=albedo, normal=normal, **options))
+            for colour, albedo, normal in zip(*channels_last, strict=True)
         ]
         return torch.stack(denoised).permute(0, 3, 1, 2).contiguous() / exposure

@@ -1,4 +1,4 @@
-"""Not in the paper, "Photon splat": no 3D network; the irradiance that photons bring to each pixel feeds the U-Net."""
+"""Photon splat, not in the paper: the photons' irradiance in each pixel feeds the U-Net, without a 3D network."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join, log_exposed
 from nlt.models.projection import total, visible_pixels
 
-_RADII = (1, 2, 4, 8)  # of footprints, in pixels beside the one in the middle
-_GRAZING = 0.01  # the least cosine: at a grazing angle a pixel sees less than its plane's area to the horizon
+_RADII = (1, 2, 4, 8)  # of footprints, in pixels from the middle one
+_GRAZING = 0.01  # least cosine: at a grazing angle a pixel sees less than the plane, which reaches the horizon
 
 
 def seen_area(batch: Batch) -> Tensor:
-    """Surface area in m² (B, 1, H, W) that each pixel sees, of the plane through its centre; 0 where no hit.
+    """Return the area in m² (B, 1, H, W) that each pixel sees of the plane through its centre; 0 where no hit.
 
-    Its solid angle, times the squared distance, over the cosine between normal and view direction.
+    It is the pixel's solid angle times the squared distance, over the cosine between normal and view direction.
     """
     camera, view = batch["camera_matrix"], batch["view_direction"]
     focal = (camera[:, 0, 0] * camera[:, 1, 1]).view(-1, 1, 1, 1)
@@ -29,7 +29,7 @@ def seen_area(batch: Batch) -> Tensor:
 
 
 class PhotonSplat(RenderingModule):
-    """G-buffer and, in three channels, the logarithm of a density estimate of irradiance by photons (Jensen 1996)."""
+    """The U-Net on the G-buffer and the log of the irradiance, a photon density estimate (Jensen 1996)."""
 
     architecture = (*RenderingModule.architecture, "footprint")
     inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "photon_flux", "photon_hit", "photon_valid")))
@@ -37,17 +37,17 @@ class PhotonSplat(RenderingModule):
     feature_channels = GBUFFER_CHANNELS + 3
 
     def __init__(self, footprint: int = 4, **kwargs: Any) -> None:
-        """The base class takes the keyword arguments.
+        """The keyword arguments are those of the base class.
 
         Args:
-            footprint: photons that an estimate is made of, if the pixel itself or the 3x3, 5x5, 9x9 or 17x17 pixels
-                around it hold so many; the fewest pixels that do are taken. 0: always the pixel alone, which is
-                unbiased; choosing by what has arrived is not, by about a tenth.
+            footprint: number of photons that an estimate needs. It uses the smallest footprint that holds as many: the
+                pixel itself, or 3x3, 5x5, 9x9 or at most 17x17 pixels. 0: always the pixel itself, which is unbiased;
+                choosing the footprint by its photons biases the estimate by about a tenth.
         """
         super().__init__(**kwargs)
 
     def irradiance(self, batch: Batch) -> Tensor:
-        """(B, 3, H, W), W·m⁻²: from emitters, on what each pixel sees; 0 where no hit."""
+        """Return the irradiance (B, 3, H, W), W·m⁻², from emitters on the surface in each pixel; 0 where no hit."""
         depth, flux = batch["depth"], batch["photon_flux"]
         camera = (batch["camera_matrix"], batch["world_to_view"])
         pixels = visible_pixels(batch["photon_hit"], batch["photon_valid"], *camera, depth, batch["normal"])

@@ -1,1 +1,1 @@
-"""`nlt bench`: what a frame, a training step and a sample cost."""
+"""`nlt bench`: the cost of a frame, a training step and a sample; `nlt teachers`: the better of two integrators."""

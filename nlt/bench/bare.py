@@ -14,10 +14,10 @@ from nlt.scenes.camera import Camera
 
 
 class Bare:
-    """A plain loop of Mitsuba's own calls; no code of ours but moving the objects.
+    """A plain loop of Mitsuba's own calls; our code only moves the objects.
 
-    As a user writes it first, every call traces its kernel anew before it finds it compiled, which at small sizes
-    takes most of the time; `frozen` is for the user who knows of `dr.freeze`.
+    Without `frozen`, as a user would first write it, every call records its kernel again before it finds the compiled
+    one, which takes most of the time at small sizes. `frozen` avoids that by `dr.freeze`.
     """
 
     def __init__(self, render: SampleRenderer, frozen: bool) -> None:
@@ -33,7 +33,7 @@ class Bare:
         self.view = mi.traverse(self.sensor)
 
     def sample(self, state: Any, camera: Camera, split: str, seed: int) -> None:
-        """What a sample of a split takes."""
+        """Render the images and trace the photons of one sample of a split."""
         self.scene.set_state(state)
         to_world = np.linalg.inv(camera.world_to_view.astype(float))
         to_world[:3, 3] *= self.scene.description.units_per_metre
@@ -46,12 +46,12 @@ class Bare:
         self.photons(seed)
 
     def render(self, integrator: Any, spp: int, seed: int) -> np.ndarray:
-        """An image of the last sample's view, by `path` or, for depth, normal and albedo, by `aov`."""
+        """Render the last sample's view with the integrator `path` or, for depth, normal and albedo, `aov`."""
         seeds = dr.opaque(mi.UInt32, seed) if dr.is_jit_v(mi.Float) else seed
         return np.array(self._image(self.scene.mi_scene, self.sensor, integrator, spp, seeds))
 
     def photons(self, seed: int) -> None:
-        """As many photons as the spec says."""
+        """Trace as many photons as the spec has."""
         count = self.spec.photons if dr.is_jit_v(mi.Float) else 1
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed, count)

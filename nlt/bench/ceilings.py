@@ -1,4 +1,4 @@
-"""What this machine can do at best: large matrix products and convolutions, memory copies, Mitsuba's bare calls."""
+"""The machine's ceilings: large matrix products and convolutions, memory copies, and Mitsuba's bare calls."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from nlt.bench.bare import Bare
 from nlt.data.render import SampleRenderer
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-_ENOUGH = 0.05  # seconds of a call, above which overheads do not count
+_ENOUGH = 0.05  # seconds of a call above which overheads are negligible
 _LARGEST = {"matmul": 8192, "convolution": 64}
 _COPIED = 1 << 28  # bytes
 
 
 def computing(device: torch.device, seconds: float) -> dict[str, float]:
-    """Operations and bytes (read and written) per second, the best of repeated calls of `seconds` / 6 each.
+    """Return operations and bytes (read and written) per second, the best of calls repeated for `seconds` / 6 each.
 
-    The convolution has 3x3 taps, 128 to 128 channels, images of 128x128; the better of both layouts counts.
+    The convolution has 3x3 taps, 128 input and 128 output channels, and images of 128x128; the faster layout counts.
     """
     share = seconds / 6
     ceilings: dict[str, float] = {}
     for name, dtype in _DTYPES.items():
-        ceilings[f"matmul_{name}"] = _grown("matmul", partial(_matmul, device, dtype), device, share)
+        ceilings[f"matmul_{name}"] = _peak_rate("matmul", partial(_matmul, device, dtype), device, share)
         ceilings[f"convolution_{name}"] = max(
-            _grown("convolution", partial(_convolution, device, dtype, layout), device, share / 2)
+            _peak_rate("convolution", partial(_convolution, device, dtype, layout), device, share / 2)
             for layout in (torch.contiguous_format, torch.channels_last)
         )
     source = torch.zeros(_COPIED // 4, device=device)
@@ -39,11 +39,11 @@ def computing(device: torch.device, seconds: float) -> dict[str, float]:
 
 
 def rendering(render: SampleRenderer, seconds: float) -> dict[str, float]:
-    """Seconds, at the spec's size, of one bare `mi.render` at 1 spp, of one with the G-buffer, of the photons alone."""
+    """Return the seconds of a bare `mi.render` at 1 spp, one of the G-buffer, and the photons, at the spec's size."""
     bare = Bare(render, frozen=True)
     camera = render.place("train", 0)
     bare.sample(render.scene.state, camera, "train", 0)
-    cpu = torch.device("cpu")  # results are copied to numpy, so nothing is left running
+    cpu = torch.device("cpu")  # results are copied to numpy, so there is nothing to wait for
     calls: dict[str, Callable[[], object]] = {
         "path_tracing": lambda: bare.render(bare.path, 1, 0),
         "gbuffer": lambda: bare.render(bare.aov, 1, 0),
@@ -53,27 +53,27 @@ def rendering(render: SampleRenderer, seconds: float) -> dict[str, float]:
 
 
 def best(call: Callable[[], object], device: torch.device, seconds: float) -> float:
-    """The least seconds that a call took, of several, one at least after one to warm up."""
-    taken: list[float] = []
+    """Return the least seconds of a call, repeated for `seconds` and at least once, after a warm-up call."""
+    times: list[float] = []
     begin = time.perf_counter()
-    while len(taken) < 2 or time.perf_counter() - begin < seconds:
+    while len(times) < 2 or time.perf_counter() - begin < seconds:
         start = time.perf_counter()
         call()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        taken.append(time.perf_counter() - start)
-    return min(taken[1:])
+        times.append(time.perf_counter() - start)
+    return min(times[1:])
 
 
-def _grown(
-    kind: str, make: Callable[[int], tuple[Callable[[], object], float]], device: torch.device, s: float
+def _peak_rate(
+    kind: str, make: Callable[[int], tuple[Callable[[], object], float]], device: torch.device, seconds: float
 ) -> float:
-    """Operations per second at the size from which on a call takes long enough."""
+    """Return the operations per second at the first size whose calls take long enough."""
     size = {"matmul": 512, "convolution": 1}[kind]
     while True:
         call, operations = make(size)
         if size >= _LARGEST[kind] or best(call, device, 0) > _ENOUGH:
-            return operations / best(call, device, s)
+            return operations / best(call, device, seconds)
         size *= 2
 
 

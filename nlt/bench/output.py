@@ -1,4 +1,4 @@
-"""A benchmark's table and figures, from bench.json alone."""
+"""A benchmark's table and figures, made from bench.json alone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Row = dict[str, Any]
 
 
 def write_report(directory: Path) -> None:
-    """bench.md, bench.png and .svg; growth.png and .svg if there is growth."""
+    """Write bench.md, bench.png and .svg, and growth.png and .svg if growth was measured."""
     content = json.loads((directory / BENCH).read_text())
     parts: list[Row] = content["parts"]
     of_kind = lambda kind: [part for part in parts if part["kind"] == kind]
@@ -34,7 +34,7 @@ def write_report(directory: Path) -> None:
 
 
 def _stages(rows: Iterable[Row]) -> list[str]:
-    """Those that any row has."""
+    """Return the stages that any row has."""
     rows = list(rows)
     return [stage for stage in STAGES if any(f"{stage}_s" in row for row in rows)]
 
@@ -62,27 +62,28 @@ def _markdown(manifest: Row, of_kind: Any) -> str:
         "",
         f"{manifest['device']}, {manifest['threads']} threads; Mitsuba {manifest['mitsuba_variant']}; "
         f"weights: {weights}; {', '.join(f'{name} {value:,}' for name, value in settings.items())}.",
-        f"`{manifest['command']}` at commit {manifest['commit']}. Load average of the machine before {before[0]:.1f}, "
-        f"after {after[0]:.1f}: other work slows what is measured, ratios less than times.",
+        f"`{manifest['command']}` at commit {manifest['commit']}. Load average of the machine: {before[0]:.1f} before, "
+        f"{after[0]:.1f} after; other work affects the ratios less than the times.",
         "",
         "## A frame",
         "",
-        f"Milliseconds of a batch of {settings['batch']}: median, in brackets the 95th percentile. Plain: eager, "
-        "float32, contiguous NCHW, nothing cached; the same frames, taking turns. Ratio: plain over usual, of "
-        "transport, projection and synthesis, frame by frame: median, 5th to 95th percentile; of each path's fastest.",
+        f"Milliseconds of a batch of {settings['batch']}: the median and, in brackets, the 95th percentile. Plain: "
+        "eager, float32, contiguous NCHW, nothing cached, with interleaved timing of the same frames. Ratio: the time "
+        "of transport, projection and synthesis, plain over usual, frame by frame: the median and, in brackets, the "
+        "5th to 95th percentile; then the ratio of each path's fastest frame.",
         "",
         *_frames(of_kind("frame"), ceilings),
         *_training(of_kind("training")),
         "## Samples",
         "",
-        f"One process rendering: {generation['train_per_second']:.2f} training samples per second, "
-        f"{generation['evaluated_per_second']:.2f} evaluated ones; {generation['of_bare_loop']:.2f} times as fast as a "
-        "bare loop of `mi.render` under `dr.freeze` that traces a training sample's rays.",
+        f"Rendering in one process: {generation['train_per_second']:.2f} training samples per second, "
+        f"{generation['evaluated_per_second']:.2f} test samples per second; {generation['of_bare_loop']:.2f} times as "
+        "fast as a bare loop of `mi.render` under `dr.freeze` that traces a training sample's rays.",
         f"Loading: {loading['samples_per_second']:.0f} samples per second, "
         f"{loading['bytes_per_second'] / 1e6:.0f} MB/s, all fields, CRCs checked, {settings['workers']} workers.",
         "",
         *_table(
-            ["of a sample", "ms"],
+            ["part of a sample", "ms"],
             [[name, f"{1e3 * seconds:.1f}"] for name, seconds in generation["stages_s"].items()],
         ),
         *_ceilings(ceilings, settings),
@@ -117,14 +118,14 @@ def _frames(rows: list[Row], ceilings: Row) -> list[str]:
     lines = _table(["method", *names, "frame", "plain frame", "ratio", "peak MiB", "frames"], table)
     if reached:
         header = ["synthesis", "precision", "parameters", "GFLOP", "GFLOP/s", "of the ceiling"]
-        lines += [*_table(header, reached), "GFLOP: the plain path's; what needs fewer may pass the ceiling.", ""]
+        lines += [*_table(header, reached), "GFLOP: the plain path's; a path with fewer may exceed the ceiling.", ""]
     return lines
 
 
 def _ceiling(row: Row, ceilings: Row) -> float:
-    """The faster of matrix product and convolution in the row's precision."""
-    found = [value for name, value in ceilings["computing"].items() if name.endswith(f"_{row['precision']}")]
-    return max(found, default=math.nan)
+    """Return the faster of matrix product and convolution in the row's precision."""
+    rates = [value for name, value in ceilings["computing"].items() if name.endswith(f"_{row['precision']}")]
+    return max(rates, default=math.nan)
 
 
 def _training(rows: list[Row]) -> list[str]:
@@ -150,8 +151,8 @@ def _ceilings(ceilings: Row, settings: Row) -> list[str]:
     names = {"path_tracing": "at 1 spp", "gbuffer": "of depth, normal and albedo", "photons": ""}
     size = settings["resolution"]
     for name, seconds in ceilings["bare_s"].items():
-        what = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else f"{settings['photons']:,} photons, bare"
-        table.append([what, f"{1e3 * seconds:.2f} ms"])
+        title = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else f"{settings['photons']:,} photons, bare"
+        table.append([title, f"{1e3 * seconds:.2f} ms"])
     return ["## This machine's ceilings, in the same run", "", *_table(["", "best"], table)]
 
 
@@ -168,13 +169,13 @@ def _growth(rows: list[Row]) -> list[str]:
     lines = [
         "## Growth",
         "",
-        "Milliseconds, medians, one setting changed at a time; the last of a batch's frames together.",
+        "Median milliseconds with one setting changed at a time; with a larger batch, those of all its frames.",
     ]
     return [*lines, "", *_table(["", *names, "frame", "peak MiB"], table)]
 
 
 def _draw_frames(directory: Path, rows: list[Row]) -> None:
-    """bench: a bar a method, stacked by stage, and below it, pale, the plain path's."""
+    """Draw bench: one bar per method, stacked by stage, and below it, paler, the bar of its plain path."""
     bars: list[tuple[str, Row, float]] = []
     for row in rows:
         bars.append((label(row["method"]), row, 1.0))
@@ -199,7 +200,7 @@ def _draw_frames(directory: Path, rows: list[Row]) -> None:
     axis.set_yticks(places, [name for name, _, _ in bars], fontsize=8)
     axis.set_ylim(places[-1] + 0.7, places[0] - 0.7)
     axis.set_xlim(0, 1.17e3 * max(row["time_per_frame_s"] for _, row, _ in bars))
-    text = "time (ms), median of each stage; x: how much faster than plain, what is rendered left out"
+    text = "time (ms), median of each stage; x: speed-up over the plain path, without the rendered stages"
     axis.set_xlabel(text, fontsize=8)
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
@@ -209,7 +210,7 @@ def _draw_frames(directory: Path, rows: list[Row]) -> None:
 
 
 def _draw_growth(directory: Path, rows: list[Row], settings: Row) -> None:
-    """growth: a row a method, a column a factor; seconds of each stage, and of the frame in black."""
+    """Draw growth: one row per method, one column per factor; the time of each stage and, in grey, of the frame."""
     methods, factors = (list(dict.fromkeys(row[key] for row in rows)) for key in ("method", "factor"))
     size = (2.7 * len(factors), 2.7 * len(methods) + 0.7)
     figure, axes = plt.subplots(len(methods), len(factors), figsize=size, squeeze=False, sharey="row")
@@ -220,20 +221,20 @@ def _draw_growth(directory: Path, rows: list[Row], settings: Row) -> None:
             if not mine:
                 axis.set_axis_off()
                 continue
-            there = [row for row in mine if "skipped" not in row]
-            x = [row["value"] for row in there]
+            measured = [row for row in mine if "skipped" not in row]
+            x = [row["value"] for row in measured]
             for stage in _stages(mine):
-                y = [1e3 * row[f"{stage}_s"] for row in there]
+                y = [1e3 * row[f"{stage}_s"] for row in measured]
                 name = stage.replace("_", " ")
                 axis.plot(x, y, color=_COLOUR[stage], marker=_MARKER[stage], ms=4, lw=1.2, label=name)
-            whole = [1e3 * row["time_per_frame_s"] for row in there]
+            whole = [1e3 * row["time_per_frame_s"] for row in measured]
             axis.plot(x, whole, color="0.5", lw=3, alpha=0.5, zorder=0, label="frame")
             axis.set(xscale="log", yscale="log", xlabel=factor)
             axis.axvline(settings[factor], color="0.6", lw=0.8, ls=":")
             for row in (row for row in mine if "skipped" in row):
                 skipped = True
                 axis.plot(row["value"], 0.95, "kx", ms=6, transform=axis.get_xaxis_transform())
-            base = settings[factor]  # labelled, and what is too near to it not
+            base = settings[factor]  # labelled; values too close to it are not
             values = [v for v in (row["value"] for row in mine) if v == base or not 0.6 < v / base < 1.7]
             axis.set_xticks(values, [f"{v // 1000}k" if v >= 1000 and v % 1000 == 0 else str(v) for v in values])
             axis.tick_params(labelsize=7)
@@ -245,7 +246,7 @@ def _draw_growth(directory: Path, rows: list[Row], settings: Row) -> None:
     }
     note = "Dotted: the value in the other panels."
     if skipped:
-        note += " Crosses: not measured, for a limit of time or memory; which, see bench.md."
+        note += " Crosses: not measured because of a time or memory limit, given in bench.md."
     figure.legend(handles.values(), handles.keys(), loc="upper center", ncols=8, fontsize=8, frameon=False)
     figure.text(0.01, 0.01, note, fontsize=7)
     height = figure.get_figheight()

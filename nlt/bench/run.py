@@ -1,4 +1,4 @@
-"""`nlt bench`: what a frame, a training step and a sample cost, beside the plain path and the machine's ceilings."""
+"""`nlt bench`: the cost of a frame, a step and a sample, compared with the plain path and the machine's ceilings."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
 from nlt.training import load_method, quiet, trainer_defaults
 
-# What may be set: of the dataset, the model, the training, and how many frames are made at once.
+# The settings of the dataset, the model and the training, and the number of frames rendered at once.
 _DATASET, _MODEL, _DATA = ("resolution", "points", "photons"), ("width", "depth"), ("batch_size", "workers")
 SETTINGS = (*_DATASET, *_MODEL, *_DATA, "batch")
-# What costs are drawn over, each by itself around the settings.
+# The factors over which the growth of costs is measured, one at a time around the settings.
 GRID: dict[str, Sequence[int]] = {
     "resolution": (64, 128, 256, 512, 1024),
     "points": (1_000, 3_000, 10_000, 30_000, 100_000),
@@ -58,17 +58,17 @@ GRID: dict[str, Sequence[int]] = {
     "width": (8, 16, 32, 64, 128),
     "batch": (1, 2, 4, 8, 16),
 }
-_POWER = {"resolution": 2, "width": 2}  # at most, of the cost; of other factors 1
-_SAMPLES = 8  # that are rendered for the frames, at least
+_POWER = {"resolution": 2, "width": 2}  # power of a factor by which costs grow at most; 1 for other factors
+_SAMPLES = 8  # least number rendered for the frames
 _TRAINING_STEPS = 40
-_RECORDED = 2  # calls in which dr.freeze records; the second, what the first took for constant
+_RECORDED = 2  # first calls, in which dr.freeze records; the second, because the first assumes constants
 _JOURNAL, _WORK = "points.jsonl", "samples"  # in the directory for work in progress
-_SAFE = 0.8  # of the free memory
+_SAFE = 0.8  # share of the free memory that a measurement may need
 
 
 @dataclass(frozen=True)
 class Part:
-    """One measurement: of what, of which method, with which one setting changed."""
+    """One measurement: its kind, its method, and the setting that is changed."""
 
     kind: str
     method: str = ""
@@ -77,7 +77,7 @@ class Part:
 
     @property
     def key(self) -> str:
-        """Its name in the journal."""
+        """The part's name in the journal."""
         return " ".join(str(word) for word in (self.kind, self.method, self.factor, self.value) if word)
 
 
@@ -92,22 +92,26 @@ def bench(
     seconds: float = 20.0,
     growth: list[str] | None = None,
 ) -> Path:
-    """Measure, and write bench.json, bench.md and the figures to the directory `out`, which it returns.
+    """Measure costs and write bench.json, bench.md and the figures to the directory `out`.
 
-    What was measured before a kill counts when the same command is given again at the same commit.
+    After a kill, the same command at the same commit reuses the finished measurements.
 
     Args:
-        data: a config of configs/data, by name or path.
-        scale: a config of configs/scale.
-        methods: configs of configs/model; None for all that are in no folder.
-        changed: settings, out of `SETTINGS`, in place of the configs'.
-        checkpoint: weights of the one method; else they are random.
+        out: the directory of the results.
+        data: a config in configs/data, by name or path.
+        scale: a config in configs/scale.
+        methods: configs in configs/model; None for all outside subfolders.
+        changed: settings, out of `SETTINGS`, that override the configs'.
+        checkpoint: weights of the only method; None for random weights.
         device: cpu or cuda; None for cuda where there is one.
-        seconds: that a measurement may take.
-        growth: methods whose cost is measured over every factor of `GRID` that touches them.
+        seconds: time limit of a measurement.
+        growth: methods whose cost is measured over every factor of `GRID` that affects them.
+
+    Returns:
+        `out` as a path.
 
     Raises:
-        UserError: an unknown config, method, setting or device, or another method's checkpoint.
+        UserError: a config, method, setting or device is unknown, or the checkpoint is another method's.
     """
     begun, start, load = origin(), time.time(), os.getloadavg()
     run = _Bench(Path(out), data, scale, methods, changed or {}, checkpoint, device, seconds, growth or [])
@@ -141,7 +145,7 @@ def bench(
 
 
 class _Bench:
-    """What `bench` was asked for, checked, and how each part is measured."""
+    """The checked arguments of `bench`, and the measurement of each part."""
 
     def __init__(
         self,
@@ -167,7 +171,7 @@ class _Bench:
                 if name not in known:
                     raise UserError(f"{option}: no method {name!r} in configs/model; known are {', '.join(known)}")
         if checkpoint and (len(self.methods) != 1 or growth):
-            raise UserError("--ckpt: is of one method; name it alone with --methods, and no --growth")
+            raise UserError("--ckpt: holds one method; name only that one with --methods, without --growth")
         self.growth = growth
         self.settings = self._settings(changed)
         self.spec = self._sized(self.settings, 1)
@@ -190,7 +194,7 @@ class _Bench:
         return settings
 
     def parts(self) -> list[Part]:
-        """All that is to be measured, in order: growth from small to large."""
+        """Return all measurements in order, those of growth from small to large."""
         trained = [name for name in self.methods if not build_if_untrained(name)]
         parts = [Part("ceilings"), Part("generation"), Part("loading")]
         parts += [Part("frame", name) for name in self.methods] + [Part("training", name) for name in trained]
@@ -204,10 +208,10 @@ class _Bench:
             ]
         return parts
 
-    # --- what was measured before a kill ---
+    # --- the journal of finished measurements ---
 
     def resume(self, begun: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """The journal's results, by key, if it is of the same command and code; else it is begun."""
+        """Return the journal's results, by key, if it is of the same command and code; otherwise begin a new one."""
         same = {name: begun[name] for name in ("command", "commit", "uncommitted_changes")}
         journal, done = self.work / _JOURNAL, dict[str, dict[str, Any]]()
         header, *lines = _read_lines(journal) or [None]
@@ -220,31 +224,31 @@ class _Bench:
         return done
 
     def note(self, part: Part, result: dict[str, Any]) -> None:
-        """Append to the journal."""
+        """Append a result to the journal."""
         with (self.work / _JOURNAL).open("a") as file:
             file.write(json.dumps({"part": part.key, "result": result}) + "\n")
 
-    # --- what is measured on ---
+    # --- data and methods ---
 
     def _sized(self, settings: Mapping[str, int], count: int) -> DatasetSpec:
-        """Of the settings' size, `count` training samples per scene and no others."""
+        """Return a spec of the settings' size with `count` training samples per scene and no others."""
         sizes: dict[str, Any] = {name: settings[name] for name in _DATASET}
         return replace(self.spec, val=0, test=0, train=count, shard_size=count, **sizes)
 
     def data(self) -> LightTransportDataModule:
-        """Of the base's samples, as in training."""
+        """Return the data module of the unchanged settings' samples, as in training."""
         dataset = self.dataset(self.settings, self._count())
         batch_size, workers = (self.settings[name] for name in _DATA)
         return LightTransportDataModule(dataset.spec, str(self.work / _WORK), batch_size, workers)
 
     def renderer(self, spec: DatasetSpec, scene: int) -> SampleRenderer:
-        """Of a scene, which is loaded once for all sizes."""
+        """Return the renderer of a scene, which is loaded once for all sizes."""
         render = self._renderer(scene)
         render.spec = spec
         return render
 
     def dataset(self, settings: Mapping[str, int], count: int) -> LightTransportDataset:
-        """At least `count` rendered samples, in training's format; rendered before they are first asked for."""
+        """Return at least `count` rendered samples in training's format; render those that do not exist yet."""
         spec = self._sized(settings, -(-count // len(self.spec.scenes)))
         directory = spec.directory(self.work / _WORK)
         for job in plan(spec, missing_files(directory, spec), 1):
@@ -253,12 +257,12 @@ class _Bench:
         return LightTransportDataset(directory, spec, "train")
 
     def frames(self, settings: Mapping[str, int], count: int) -> Frames:
-        """For the clock."""
+        """Return frames for the clock."""
         dataset = self.dataset(settings, count)
         return Frames(dataset, lambda scene: self.renderer(dataset.spec, scene))
 
     def method(self, name: str, settings: Mapping[str, int]) -> Method:
-        """A method with random weights, or the checkpoint's."""
+        """Return a method with random weights or the checkpoint's."""
         if method := build_if_untrained(name):
             return method
         if self.checkpoint:
@@ -277,21 +281,21 @@ class _Bench:
         method = load_method(str(self.checkpoint), "--ckpt", self.device)
         wanted = read_configs([str(find_config("model", name))])["model"]["class_path"]
         if method.class_path() != wanted:
-            raise UserError(f"--ckpt: {self.checkpoint}: is of {method.class_path()}, not {wanted}; give its --methods")
+            raise UserError(f"--ckpt: {self.checkpoint}: is of {method.class_path()}, not {wanted}; give its method")
         points = self.settings["points"]
         points = min(points, method.hparams["max_points"] or points)
         for key, here in (("num_points", points), ("num_scenes", len(self.spec.scenes))):
             if key in method.architecture and method.hparams[key] != here:
                 raise UserError(
-                    f"--ckpt: {self.checkpoint}: has {key}={method.hparams[key]}, these settings {here}: "
-                    "use its --data, --scale and --set points"
+                    f"--ckpt: {self.checkpoint}: has {key}={method.hparams[key]}, these settings have {here}: "
+                    "use the --data, --scale and --set points it was trained with"
                 )
         return method
 
     # --- the measurements ---
 
     def measure(self, part: Part, done: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-        """A part's result; `skipped` says why there is none. `done`: the results before it."""
+        """Measure a part and return its result, or `skipped` with the reason; `done` holds the earlier results."""
         if part.kind == "ceilings":
             render = self.renderer(replace(self.spec, train=1), 0)
             computing = ceilings.computing(self.device, self.seconds)
@@ -322,16 +326,16 @@ class _Bench:
             **clock.size(method),
             "timed_frames": len(timed),
             "plain": summary(slow),
-            "speedup": speedup | {"of_least": min(network[0]) / min(network[1])},  # other work can only slow a frame
+            "speedup": speedup | {"of_least": min(network[0]) / min(network[1])},  # other work only slows a frame
             **_precision_and_flops(clock, method),
         }
 
     def _growth(self, part: Part, done: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
         settings = self.settings | {part.factor: part.value}
-        if settings == self.settings:  # as in the other factors' middles
+        if settings == self.settings:  # the same as in the other factors
             for other in GRID:
-                if found := done.get(replace(part, factor=other, value=self.settings[other]).key):
-                    return found
+                if result := done.get(replace(part, factor=other, value=self.settings[other]).key):
+                    return result
         smaller = [
             (value, done[key])
             for value in (*GRID[part.factor], self.settings[part.factor])
@@ -340,13 +344,13 @@ class _Bench:
         if smaller:
             value, last = max(smaller, key=lambda pair: pair[0])
             if "skipped" in last:
-                return {"skipped": f"so was {part.factor} {value:,}"}
+                return {"skipped": f"{part.factor} {value:,} was skipped"}
             factor = (part.value / value) ** _POWER.get(part.factor, 1)
-            took, free = factor * last["time_per_frame_s"], _free_memory(self.device)
-            if took > self.seconds:
-                return {"skipped": f"a frame is predicted to take {took:.1f} s, more than {self.seconds:g} s"}
+            predicted, free = factor * last["time_per_frame_s"], _free_memory(self.device)
+            if predicted > self.seconds:
+                return {"skipped": f"a frame is predicted to take {predicted:.1f} s, more than {self.seconds:g} s"}
             if (need := factor * last.get("peak_memory_bytes", 0)) > _SAFE * free:
-                return {"skipped": f"predicted to need {need / 2**30:.1f} GiB, {free / 2**30:.1f} are free"}
+                return {"skipped": f"predicted to need {need / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free"}
         count = LEAST_FRAMES if part.factor in _DATASET and settings != self.settings else self._count()
         clock = Clock(self.frames(settings, count), self.device, settings["batch"])
         method = self.method(part.method, settings)
@@ -354,7 +358,7 @@ class _Bench:
         return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
 
     def _training(self, name: str, frame: Mapping[str, Any]) -> dict[str, Any]:
-        """Images per second of the trainer's own loop, and the share of a step that it waits for data."""
+        """Measure the trainer's images per second and the share of a step in which it waits for data."""
         size = self.settings["batch_size"]
         step = 3 * size * _network(frame, "_s") / self.settings["batch"]
         if 2 * step > self.seconds:
@@ -381,7 +385,7 @@ class _Bench:
         }
 
     def _loading(self) -> dict[str, Any]:
-        """Samples per second of the DataLoader alone, with all fields and their CRCs, from files read before."""
+        """Measure samples per second of the DataLoader alone, with all fields and CRCs, from cached files."""
         data = self.data()
         data.setup("fit")
         loader = data.train_dataloader()
@@ -395,7 +399,7 @@ class _Bench:
         return {"samples_per_second": rate, "bytes_per_second": rate * data.spec.nbytes("train")}
 
     def _generation(self) -> dict[str, Any]:
-        """Samples per second of one process, by kind, and the ratio to the bare loop of the same rays in turns."""
+        """Measure samples per second of one process and, with interleaved timing, the ratio to a bare loop."""
         spec = replace(self.spec, train=_SAMPLES)
         render = self.renderer(spec, 0)
         bare = Bare(render, frozen=True)
@@ -408,7 +412,7 @@ class _Bench:
         ):
             k = len(pairs) % _SAMPLES
             sample, ours = _timed(partial(render.sample, "train", k))
-            camera, state = views[k - 1]  # not the state that the scene is in
+            camera, state = views[k - 1]  # another view, so that the bare loop moves the objects too
             _, theirs = _timed(partial(bare.sample, state, camera, "train", k))
             pairs.append((ours, theirs))
             stages.append(laps(render, k, partial(write_shard, self.work / "shard", [sample])))
@@ -424,7 +428,7 @@ class _Bench:
 
 
 class _Steps(L.Callback):
-    """Seconds of a training's steps, by what goes on: waiting for the batch, computing."""
+    """Records the seconds that each training step waits for its batch and computes."""
 
     def __init__(self, seconds: float, device: torch.device) -> None:
         self.waited, self.computed = list[float](), list[float]()
@@ -442,12 +446,12 @@ class _Steps(L.Callback):
             self.waited.append(self.start - self.end)
             self.computed.append(now - self.start)
         self.end = now
-        taken = len(self.waited)
-        trainer.should_stop = taken >= _TRAINING_STEPS or (taken > 0 and now - self.begin > self.seconds)
+        steps = len(self.waited)
+        trainer.should_stop = steps >= _TRAINING_STEPS or (steps > 0 and now - self.begin > self.seconds)
 
 
 def _read_lines(journal: Path) -> list[Any]:
-    """The journal's lines; a last one that a kill tore is passed over."""
+    """Return the journal's lines, without a last one that a kill cut off."""
     lines = []
     for line in journal.read_text().splitlines() if journal.exists() else []:
         try:
@@ -468,12 +472,12 @@ def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:
 
 
 def _precision_and_flops(clock: Clock, method: RenderingModule) -> dict[str, Any]:
-    """In which precision the last convolution gives its result, and operations by step: both of the same batch."""
-    found: list[torch.dtype] = []
-    hook = method.unet.conv_out.register_forward_hook(lambda _, __, output: found.append(output.dtype))
+    """Return the precision of the last convolution's output and the operations of each step, on one batch."""
+    dtypes: list[torch.dtype] = []
+    hook = method.unet.conv_out.register_forward_hook(lambda _, __, output: dtypes.append(output.dtype))
     flops = clock.flops(method)
     hook.remove()
-    return {"precision": str(found[0]).removeprefix("torch."), "step_flops": flops}
+    return {"precision": str(dtypes[0]).removeprefix("torch."), "step_flops": flops}
 
 
 def _touches(factor: str, method: Method) -> bool:
@@ -486,12 +490,12 @@ def _device(name: str | None) -> torch.device:
     if name not in (None, "cpu", "cuda"):
         raise UserError(f"--device: must be cpu or cuda, is {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device: cuda: there is none here; use --device cpu")
+        raise UserError("--device: cuda: this machine has none; use --device cpu")
     return torch.device(name) if name else default_device()
 
 
 def _free_memory(device: torch.device) -> float:
-    """Bytes that a measurement may take."""
+    """Return the free memory in bytes, infinite where it is unknown."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     try:

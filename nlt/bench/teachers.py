@@ -1,10 +1,10 @@
-"""`nlt teachers`: which teacher has the lower variance at equal time, scene by scene.
+"""`nlt teachers`: which integrator, path or bdpt, has the lower variance at equal time, scene by scene.
 
-Both render the same views, in the same states, in turns. An efficiency is 1 / (variance * time), so the ratio of two
-says how much lower the one's variance is where both take the same time. The linear radiance's decides, for that is
-what is learnt from; but where a few fireflies make most of a variance, its estimate says little. Two figures tell: the
-bootstrap interval over renders, and the share of the variance that the one worst pixel of all makes. What the eye sees
-is the variance after the display transform, in which fireflies are clipped.
+Both render the same views in the same states, with interleaved timing. Efficiency is 1 / (variance * time), so the
+ratio of two efficiencies is the ratio of the variances at equal time. The variance of linear radiance decides, because
+methods are trained on linear radiance. Its estimate is unreliable where a few fireflies make up most of it; two figures
+show this: the bootstrap interval over renders, and the share of the variance that comes from the worst pixel. The
+variance after the display transform, which clips fireflies, is the variance that the eye sees.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from nlt.scenes.views import Views
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-_SPP = 16  # of a render
-_LEAST = 8  # renders of every view
-_BLOCK = 4  # pixels, over which the agreement is tested
+_SPP = 16  # samples per pixel of a render
+_LEAST = 8  # least number of renders of every view
+_BLOCK = 4  # width in pixels of the blocks whose agreement is tested
 _RESAMPLES = 1000
-_ACROSS = 4  # panels
-_UNSURE = 0.1  # share of the variance that one pixel makes, above which the table warns
+_ACROSS = 4  # panels in a row
+_UNSURE = 0.1  # share of the variance in one pixel above which the table warns
 _COLOURS = {"path": "#0072B2", "bdpt": "#D55E00"}
 
 
@@ -51,23 +51,29 @@ def teachers(
     experiment: str = "fixed_lights",
     seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """Compare the teachers in scenes; write table.csv, table.md, teachers.png and manifest.json.
+    """Compare the integrators in scenes; write table.csv, table.md, teachers.png and manifest.json.
 
     Args:
-        seconds: per scene, warm-up not included.
+        names: scenes, by name or path.
+        out: the directory of the results.
+        seconds: rendering time per scene, without the warm-up.
+        resolution: pixels on each side of a view.
+        views: number of views per scene.
+        experiment: the experiment from which states are drawn.
+        seed: seed of the states, the views and the renders.
 
     Returns:
-        A row per scene: `ratio` is the efficiency of bdpt over that of path, above one where bdpt is better.
+        A row per scene. `ratio` is the efficiency of bdpt over that of path: above one, bdpt is better.
 
     Raises:
         UserError: a scene is unknown or does not load, or Mitsuba's variant cannot run bdpt.
     """
     begun = origin()
     for name in names:
-        load_description(name)  # mistakes show before anything is rendered
-    choose_variant()  # once; the processes inherit it
+        load_description(name)  # reports mistakes before anything is rendered
+    choose_variant()  # chosen once; the processes inherit it
     rows = []
-    # A process per scene: Mitsuba's memory grows with every one.
+    # A process per scene, because Mitsuba's memory grows with every scene.
     for name in names:
         rows.append(Process(_measure, name, seconds, resolution, views, experiment, seed).result())
         print(_line(rows[-1]), flush=True)
@@ -93,7 +99,7 @@ def _measure(name: str, seconds: float, resolution: int, views: int, experiment:
         placed.append((scene.state, look.sample(resolution, rng)))
     images: dict[str, list[list[np.ndarray]]] = {teacher: [[] for _ in placed] for teacher in TEACHERS}
     times: dict[str, list[float]] = {teacher: [] for teacher in TEACHERS}
-    start, renders = time.perf_counter(), -1  # the first of all is the warm-up
+    start, renders = time.perf_counter(), -1  # the first render is the warm-up
     while renders < _LEAST or time.perf_counter() - start < seconds:
         if renders < 1:
             start = time.perf_counter()
@@ -116,14 +122,14 @@ def _measure(name: str, seconds: float, resolution: int, views: int, experiment:
 def _figures(
     images: dict[str, np.ndarray], times: dict[str, list[float]], exposure: float, resolution: int
 ) -> dict[str, Any]:
-    """What a row says, of images (views, renders, 3, H, W) and seconds per render, by teacher."""
+    """Return a row's figures from images (views, renders, 3, H, W) and seconds per render, by integrator."""
     views, renders = images["path"].shape[:2]
     rng = np.random.default_rng(0)
     counts = rng.multinomial(renders, np.full(renders, 1 / renders), (_RESAMPLES, views)).astype(float)
     row: dict[str, Any] = {}
     work, resampled = {}, {}
     for teacher, linear in images.items():
-        row[f"{teacher}_s"] = float(np.median(times[teacher])) / (resolution**2 * _SPP)  # of one sample of a pixel
+        row[f"{teacher}_s"] = float(np.median(times[teacher])) / (resolution**2 * _SPP)  # per sample of a pixel
         flat = linear.reshape(views, renders, -1)
         products = flat @ flat.transpose(0, 2, 1) / flat.shape[2]
         variances = _SPP * _variance(products, np.ones((1, views, renders)))
@@ -137,19 +143,19 @@ def _figures(
     ratios = resampled["path"] / resampled["bdpt"]
     row["ratio"] = work["path"] / work["bdpt"]
     row["ratio_low"], row["ratio_high"] = (float(q) for q in np.quantile(ratios, (0.025, 0.975)))
-    seen = {teacher: row[f"{teacher}_display_variance"] * row[f"{teacher}_s"] for teacher in images}
-    row["display_ratio"] = seen["path"] / seen["bdpt"]
+    displayed = {teacher: row[f"{teacher}_display_variance"] * row[f"{teacher}_s"] for teacher in images}
+    row["display_ratio"] = displayed["path"] / displayed["bdpt"]
     row["p_agreement"] = _agreement(images["path"], images["bdpt"])
     row["better"] = "bdpt" if row["ratio_low"] > 1 else "path" if row["ratio_high"] < 1 else "undecided"
     return row
 
 
 def _variance(products: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(K,) mean over views and pixels of the variance over renders.
+    """Return the variance over renders, averaged over views and pixels: (K,).
 
     Args:
         products: (views, renders, renders), mean products of two renders' pixels.
-        counts: (K, views, renders), how often a render is drawn.
+        counts: (K, views, renders), the number of times that a render is drawn.
     """
     n = products.shape[1]
     square = np.einsum("kvr,vrr->kv", counts, products) / n
@@ -158,7 +164,7 @@ def _variance(products: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _agreement(first: np.ndarray, second: np.ndarray) -> float:
-    """The p-value, after Bonferroni's correction, of Welch's test of the block of pixels that differs most."""
+    """Return the Bonferroni-corrected p-value of Welch's test on the block of pixels that differs most."""
     blocks = []
     for images in (first, second):
         views, renders, _, height, width = images.shape
@@ -177,12 +183,12 @@ def _line(row: dict[str, Any]) -> str:
 
 def _markdown(rows: list[dict[str, Any]]) -> str:
     lines = [
-        "# Teachers",
+        "# Integrators",
         "",
         "Variance of one sample per pixel (linear radiance), and time of one sample of one pixel. The ratio is path's",
-        "variance over bdpt's at equal time: above one, bdpt is better. Behind it the 95% bootstrap interval over",
-        "renders, which decides; then the ratio after the display transform, in which fireflies are clipped. !: one",
-        f"pixel makes more than {_UNSURE:.0%} of the variance, whose estimate is unreliable. p: that both agree.",
+        "variance over bdpt's at equal time: above one, bdpt is better. The 95% bootstrap interval over renders, in",
+        "brackets, decides. Displayed: the ratio after the display transform, which clips fireflies. !: one pixel",
+        f"makes up more than {_UNSURE:.0%} of the variance: its estimate is unreliable. p: of a test that both agree.",
         "",
         "| scene | path: µs | variance | bdpt: µs | variance | ratio at equal time | displayed | p | better |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---|",
@@ -199,7 +205,7 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def _draw(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Variance over time, a panel per scene; along a line the samples per pixel grow."""
+    """Plot variance over time, one panel per scene; the samples per pixel grow along a line."""
     across = min(_ACROSS, len(rows))
     down = -(-len(rows) // across)
     figure, axes = plt.subplots(down, across, figsize=(3.4 * across, 3.4 * down), squeeze=False)

@@ -1,1 +1,1 @@
-"""The sample, the store, generation and the DataModule."""
+"""Datasets: the sample format, storage, generation and the DataModule."""

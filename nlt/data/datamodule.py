@@ -1,4 +1,4 @@
-"""The one DataModule: batches of samples, of several scenes at once, for every method."""
+"""The DataModule of every method: batches of samples from one or several scenes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class LightTransportDataModule(L.LightningDataModule):
     """Loads a generated dataset.
 
     Args:
-        dataset: what it holds; `nlt generate` makes it.
+        dataset: the dataset's spec; `nlt generate` renders the dataset.
         root: directory or fsspec URL of datasets.
-        batch_size: samples per step and process (paper: 32, static scenes 128).
-        workers: threads that load; online, processes that render.
-        seed: of the shuffling; online, of which samples there are.
-        online: render the training samples while training, each for one step alone, and store none. An epoch is
-            as many as `dataset.train` says; validation and test samples are generated and stored as ever.
-        train_images: train on the first so many of each scene's samples alone; an epoch has as many steps as with all.
+        batch_size: samples per step and process (paper: 32, or 128 for static scenes).
+        workers: threads that load samples; with `online`, processes that render them.
+        seed: seed of the shuffling; with `online`, of the training samples.
+        online: render training samples during training, use each for one step and store none. An epoch has
+            `dataset.train` samples per scene. Validation and test samples are still generated and stored.
+        train_images: use only this many training samples of each scene; the number of steps per epoch stays the same.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class LightTransportDataModule(L.LightningDataModule):
     ) -> None:
         super().__init__()
         if online and workers < 1:
-            raise UserError(f"data.workers: must be at least 1, is {workers}: with data.online, they render")
+            raise UserError(f"data.workers: must be at least 1, is {workers}: with data.online, they render samples")
         if batch_size < 1:
             raise UserError(f"data.batch_size: must be at least 1, is {batch_size}")
         if train_images is not None and (online or not 1 <= train_images <= dataset.train):
             raise UserError(
-                f"data.train_images: must be 1 to data.dataset.train ({dataset.train}), and not with data.online, "
+                f"data.train_images: must be 1 to data.dataset.train ({dataset.train}) and not set with data.online, "
                 f"is {train_images}"
             )
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
@@ -60,44 +60,47 @@ class LightTransportDataModule(L.LightningDataModule):
         self.points: list[int] = []
 
     def next_pass(self) -> int:
-        """Which pass over the online samples begins; each comes once."""
+        """Return the index of the next pass over the online samples and count it."""
         self.passes += 1
         return self.passes - 1
 
     def state_dict(self) -> dict[str, Any]:
-        """For checkpoints: of which points the embeddings are, a CRC of each scene's; how many passes over online
-        samples were begun, behind which a resumed run goes on."""
+        """Return the state for a checkpoint.
+
+        `points` has a CRC of each scene's points, to which embeddings belong. `passes` is the number of passes over
+        online samples that were started; a resumed run continues after them.
+        """
         return {"points": self.points, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on where a checkpoint's run was.
+        """Restore the state of a checkpoint.
 
         Raises:
-            UserError: the method has embeddings, of other points than the dataset's.
+            UserError: the method's embeddings belong to other points than the dataset's.
         """
         self.passes = state_dict.get("passes", 0)
         points, method = state_dict.get("points"), getattr(self.trainer, "lightning_module", None)
         if getattr(method, "has_point_embeddings", False) and points and self.points and points != self.points:
             raise UserError(
-                f"{self.directory}: has other points than those that the checkpoint's embeddings are of, as when it is "
-                "rendered with another NLT_VARIANT; give --data.root with the checkpoint's own dataset, or train anew"
+                f"{self.directory}: its points differ from those of the checkpoint's embeddings, for example because "
+                "another NLT_VARIANT rendered it; give --data.root with the checkpoint's own dataset, or train again"
             )
 
     @property
     def num_scenes(self) -> int:
-        """Scenes in the dataset: each has its own embeddings."""
+        """Number of scenes in the dataset, each of which has its own embeddings."""
         return len(self.spec.scenes)
 
     @property
     def num_points(self) -> int:
-        """Points per scene."""
+        """Number of points per scene."""
         return self.spec.points
 
     def setup(self, stage: str) -> None:
-        """Check the manifest.
+        """Check that the dataset exists and read its points.
 
         Raises:
-            UserError: the dataset is missing, incomplete, or another one.
+            UserError: the dataset is missing, incomplete or has another spec.
         """
         if self.directory is None:
             directory = self.stored.directory(self.root)
@@ -106,18 +109,18 @@ class LightTransportDataModule(L.LightningDataModule):
             self.points = [points_crc(read_points(directory / points_name(k))) for k in range(self.num_scenes)]
 
     def split(self, name: str) -> LightTransportDataset:
-        """The dataset of a split, with the fields that the trainer's method needs; all without a trainer."""
+        """Return the dataset of a split with the fields that the trainer's method needs, or all without a trainer."""
         assert self.directory is not None, "call setup first"
         module = getattr(self.trainer, "lightning_module", None)
         fields = getattr(module, "fields", None)
         if self.online and name == "train":
-            from nlt.data.online import OnlineDataset  # which needs Mitsuba
+            from nlt.data.online import OnlineDataset  # here, because it needs Mitsuba
 
             devices = self.trainer.num_devices if self.trainer else 1
             threads = max(1, available_cpus() // (self.workers * devices))
             return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads)
-        few = name == "train" and self.train_images
-        spec = dataclasses.replace(self.stored, train=few) if few else self.stored
+        limit = name == "train" and self.train_images
+        spec = dataclasses.replace(self.stored, train=limit) if limit else self.stored
         return LightTransportDataset(self.directory, spec, name, fields)
 
     def _loader(self, name: str) -> DataLoader:
@@ -132,8 +135,8 @@ class LightTransportDataModule(L.LightningDataModule):
         sampler: Sampler[int] = EpochSampler(length, rank, processes, training, self.seed, len(dataset))
         if online:
             sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
-        # Rendering needs processes, for Mitsuba; it starts threads, which a fork would lose. No leak: the memory of one
-        # scene's renderer stays.
+        # Mitsuba needs processes of its own, spawned because a fork would lose its threads. They may live long because
+        # the memory of a single scene's renderer does not grow.
         kind = partial(DataLoader, multiprocessing_context="spawn", persistent_workers=True) if online else ThreadLoader
         return kind(
             dataset,
@@ -146,17 +149,17 @@ class LightTransportDataModule(L.LightningDataModule):
         )
 
     def train_dataloader(self) -> DataLoader:
-        """Shuffled training samples."""
+        """Return a loader of shuffled training samples."""
         return self._loader("train")
 
     def val_dataloader(self) -> DataLoader:
-        """Validation samples, in order."""
+        """Return a loader of the validation samples in order."""
         return self._loader("val")
 
     def test_dataloader(self) -> DataLoader:
-        """Test samples, in order."""
+        """Return a loader of the test samples in order."""
         return self._loader("test")
 
     def predict_dataloader(self) -> DataLoader:
-        """Test samples, in order."""
+        """Return a loader of the test samples in order."""
         return self._loader("test")

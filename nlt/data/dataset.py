@@ -1,4 +1,4 @@
-"""The samples of a split as tensors, and in which order they come. Light to import: rendering processes do."""
+"""Datasets that return samples as tensors, and their samplers. Rendering processes import this, so keep it light."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _TARGETS["test"] = _TARGETS["val"]
 
 
 class SampleTensors:
-    """What is stored of samples, as the tensors of `FIELDS` and `BATCH_FIELDS` that a method reads.
+    """Converts stored samples to the tensors of `FIELDS` and `BATCH_FIELDS` that a method reads.
 
     Args:
-        spec: of the dataset.
-        points: the point cloud of each scene, by the scene's number.
-        wanted: fields to be made of what is stored, of points and camera; None for all.
+        spec: the dataset's spec.
+        points: the point cloud of each scene, by the scene's index.
+        wanted: names of the fields to derive from the stored arrays, points and camera; None for all.
     """
 
     def __init__(self, spec: DatasetSpec, points: Mapping[int, Points], wanted: Set[str] | None = None) -> None:
@@ -41,11 +41,11 @@ class SampleTensors:
         }
 
     def wants(self, name: str) -> bool:
-        """Whether a field is to be made."""
+        """Whether the method reads this field."""
         return self._wanted is None or name in self._wanted
 
     def __call__(self, scene: int, stored: Mapping[str, np.ndarray], index: int = 0) -> dict[str, Tensor]:
-        """A sample of a scene; `index`: its number in the split."""
+        """Return a sample of a scene as tensors; `index` is its index in the split."""
         sample = {name: torch.from_numpy(array) for name, array in stored.items()}
         if self.wants("view_direction"):
             height, width = stored["noisy"].shape[-2:]
@@ -57,7 +57,7 @@ class SampleTensors:
         return sample
 
     def _point_fields(self, scene: int, stored: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-        """The static points, moved and hidden as the sample's state says (supplementary, Sec. Datasets)."""
+        """Return the points, moved and hidden according to the sample's state (supplementary, Sec. Datasets)."""
         if "present" not in stored:
             return {}
         position, visible = place_points(self._points[scene], stored["translation"], stored["present"])
@@ -72,10 +72,10 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
     """The samples of one split, as the fields of `FIELDS` and `BATCH_FIELDS` that `inputs` names.
 
     Args:
-        directory: of the dataset.
-        spec: what it holds.
+        directory: the dataset's directory.
+        spec: the dataset's spec.
         split: train, val or test.
-        inputs: fields that the method reads; None for all. The split's target fields come along.
+        inputs: names of the fields that the method reads; None for all. The split's target fields are added.
     """
 
     def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
@@ -96,15 +96,15 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
         return len(self.spec.scenes) * self.spec.count(self.split)
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """One sample; floats are float32."""
+        """Return one sample; floats are float32."""
         return {name: tensor[0] for name, tensor in self.__getitems__([index]).items()}
 
     def __getitems__(self, indices: list[int]) -> dict[str, Tensor]:
-        """A batch; each value is copied once. A `DataLoader` takes it as it is, with `identity_collate`."""
+        """Return a collated batch, copying each value once; a `DataLoader` needs `identity_collate` for it."""
         return collate([self._tensors(*self._sample(index), index) for index in indices])
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
-        """The scene of a sample, and what is stored of it."""
+        """Return the scene of a sample and its stored arrays."""
         scene, row = divmod(index, self.spec.count(self.split))
         shard = self.spec.shard(self.split, scene, row)
         return scene, self._reader.read(self.directory / shard.name, row - shard.start, self._stored)
@@ -113,24 +113,24 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 def place_points(
     points: dict[str, np.ndarray], translation: np.ndarray, present: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 3) and visibility (N,) of a scene's points in a state: translation (M, 3) and present (M,)."""
-    # Row -1, for what never moves, stays where it is.
+    """Return positions (N, 3), metres, and visibility (N,) of points, given `translation` (M, 3) and `present` (M,)."""
+    # Static points have object index -1 and so select the appended row, which leaves them in place.
     translation, present = np.concatenate([translation, np.zeros((1, 3), np.float32)]), np.append(present, True)
     return points["position"] + translation[points["object"]], present[points["object"]]
 
 
 def collate(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Samples as a batch; halves become float32."""
+    """Collate samples into a batch; float16 becomes float32."""
     return {name: stack([sample[name] for sample in samples]) for name in samples[0]}
 
 
 def identity_collate(batch: Any) -> Any:
-    """For `DataLoader(collate_fn=...)`: a batch of a `LightTransportDataset` is collated as it is read."""
+    """Return the batch unchanged; a `DataLoader` needs it as its collate_fn because the dataset already collates."""
     return batch
 
 
 def stack(tensors: list[Tensor]) -> Tensor:
-    """As torch.stack, halves as float32; what all samples share, the static points of one scene, is not copied."""
+    """Stack tensors, float16 as float32. A tensor shared by all samples, such as a scene's points, is not copied."""
     dtype = tensors[0].dtype
     if dtype != torch.float16 and all(tensor is tensors[0] for tensor in tensors):
         return tensors[0].expand(len(tensors), *tensors[0].shape)
@@ -141,11 +141,11 @@ def stack(tensors: list[Tensor]) -> Tensor:
 
 
 class EpochSampler(Sampler[int]):
-    """This process's part of the dataset: shuffled by (seed, epoch) alone, so that a resumed run continues it.
+    """This process's indices, shuffled by (seed, epoch) only so that a resumed run continues in the same order.
 
-    While training, every process gets equally many samples and what is left over is dropped; at evaluation,
-    each sample is seen once by exactly one process. `distinct`: samples that there are, if less than the epoch's
-    `length`: all come again, in another order, until it is full.
+    In training, every process gets the same number of samples and the remainder is dropped. In evaluation, each sample
+    is read once, by exactly one process. If `distinct`, the number of samples in the dataset, is smaller than the
+    epoch's `length`, all samples are repeated in new orders until the epoch is full.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class EpochSampler(Sampler[int]):
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning before each epoch."""
+        """Set the epoch; Lightning calls this before each one."""
         self.epoch = epoch
 
     def __len__(self) -> int:
@@ -174,9 +174,10 @@ class EpochSampler(Sampler[int]):
 
 
 class OnlineSampler(EpochSampler):
-    """This process's part of an endless sequence of samples: each pass takes the next `length` numbers of it.
+    """This process's indices in an endless sequence of samples; each pass takes the next `length` of them.
 
-    `next_pass` counts them, not Lightning's epochs: a run that ended within an epoch goes on with that one.
+    `next_pass` counts the passes. Lightning's epochs cannot: a run that stopped within an epoch resumes that epoch and
+    would repeat its samples.
     """
 
     def __init__(self, length: int, rank: int, processes: int, seed: int, next_pass: Callable[[], int]) -> None:
@@ -184,5 +185,5 @@ class OnlineSampler(EpochSampler):
         self.next_pass = next_pass
 
     def __iter__(self) -> Iterator[int]:
-        first = (self.seed << 32) + self.next_pass() * self.length  # no two seeds share a number
+        first = (self.seed << 32) + self.next_pass() * self.length  # different seeds share no index
         return iter(range(first + self.rank, first + self.length, self.processes)[: len(self)])

@@ -1,6 +1,6 @@
-"""Where jobs run: in processes of this machine, on a Dask cluster, in a Slurm array.
+"""Engines that run jobs in processes on this machine, on a Dask cluster or in a Slurm array.
 
-Every job has a process of its own that ends with it: Mitsuba's memory grows with every scene and state.
+Every job runs in its own process, which ends with the job, because Mitsuba's memory grows with every scene and state.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import Any, Protocol
 from nlt.errors import UserError
 from nlt.waiting import as_the_user_said
 
-# work(job, threads, tick) does a job with so many threads and calls tick(n) after every n samples.
+# work(job, threads, tick) does a job with the given number of threads and calls tick(n) after every n samples.
 Work = Callable[[Any, int, Callable[[int], None]], None]
-# What an engine yields now and then: the samples ticked so far, None if it cannot know.
+# An engine regularly yields the number of samples finished so far, or None if it cannot know.
 Ticks = Generator[int | None, None, None]
 _CONTEXT = multiprocessing.get_context("spawn")
 _POLL, _CONNECT = 1.0, 20.0  # seconds
@@ -34,12 +34,12 @@ class Died(Exception):
 
 
 class Engine(Protocol):
-    """Runs jobs, up to `workers` of them side by side."""
+    """Runs jobs, up to `workers` of them concurrently."""
 
     workers: int
 
-    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
-        """Run all jobs. One that dies is run once more; if it dies again, `died` says of what, and the others go on.
+    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
+        """Run all jobs. A job that dies is retried once; if it dies again, the reason is added to `failures`.
 
         Raises:
             UserError: `work` raised it.
@@ -48,40 +48,44 @@ class Engine(Protocol):
 
 
 def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], preload: tuple[str, ...] = ()) -> Engine:
-    """The engine that `--scheduler` names: local, slurm, slurm-local, or a Dask scheduler's address.
+    """Return the engine that `--scheduler` names: local, slurm, slurm-local or a Dask scheduler's address.
 
     Args:
-        workers: jobs side by side (default: a core each; on Dask, as it has threads; in a Slurm array, 64).
+        scheduler: value of `--scheduler`.
+        workers: number of concurrent jobs (default: the available CPUs; on Dask, its threads; in a Slurm array, 64).
         slurm: options of a Slurm job.
-        preload: modules that take long to import and start no threads (so not Mitsuba): imported once on a machine.
+        preload: modules to import once per machine: slow to import, and without threads of their own (so not Mitsuba).
+
+    Raises:
+        UserError: the scheduler is unknown, not installed or not reachable, or the options do not fit it.
     """
     if slurm and scheduler != "slurm":
-        raise UserError("--slurm: options for --scheduler slurm alone")
+        raise UserError("--slurm: only works with --scheduler slurm")
     if scheduler == "local":
         return Local(workers or available_cpus(), preload)
     if scheduler in ("slurm", "slurm-local"):
         return Slurm(scheduler, workers or _SLURM_WORKERS, slurm)
     if "://" in scheduler:
         return Dask(scheduler, workers, preload)
-    raise UserError(f"--scheduler: must be local, slurm or an address such as tcp://host:8786, is {scheduler!r}")
+    raise UserError(f"--scheduler: must be local, slurm or a Dask address such as tcp://host:8786, is {scheduler!r}")
 
 
 def available_cpus() -> int:
-    """Of this machine that this process may use."""
+    """Return the number of CPUs that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Local:
-    """Processes of this machine."""
+    """Runs jobs in processes on this machine."""
 
     def __init__(self, workers: int, preload: tuple[str, ...] = ()) -> None:
         self.workers, self._preload = workers, preload
 
-    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         waiting, threads = list(jobs), max(1, available_cpus() // self.workers)
         running: dict[Process, Any] = {}
         counters: dict[Any, Any] = {}
-        tried = set()
+        retried = set()
         try:
             while waiting or running:
                 while waiting and len(running) < self.workers:
@@ -96,10 +100,10 @@ class Local:
                     try:
                         process.result()
                     except Died as error:
-                        if job in tried:
-                            died[job] = str(error)
+                        if job in retried:
+                            failures[job] = str(error)
                         else:
-                            tried.add(job)
+                            retried.add(job)
                             waiting.append(job)
         finally:
             for process in running:
@@ -107,7 +111,7 @@ class Local:
 
 
 class Dask:
-    """A Dask cluster. A job whose worker is lost goes to another one, as often as the scheduler allows."""
+    """Runs jobs on a Dask cluster, which reruns the job of a lost worker on another one, up to its retry limit."""
 
     def __init__(self, address: str, workers: int | None, preload: tuple[str, ...] = ()) -> None:
         self._address, self._preload = address, preload
@@ -121,15 +125,15 @@ class Dask:
         except (OSError, ValueError) as error:
             raise UserError(f"--scheduler: {self._address}: no Dask scheduler answers ({error})") from None
 
-    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         with self._connect() as client:
-            # Pickled, so that Dask's workers need not import what the work does.
+            # Pickled here, so that Dask's workers do not import the modules that the work needs.
             submit = lambda job: client.submit(_on_dask, pickle.dumps((work, job)), self._preload, pure=False)
-            yield from _wait({submit(job): job for job in jobs}, submit, died)
+            yield from _wait({submit(job): job for job in jobs}, submit, failures)
 
 
 class Slurm:
-    """A Slurm array by submitit, its logs in runs/slurm; `slurm-local` runs it without Slurm, to try it out."""
+    """Runs jobs in a Slurm array with logs in runs/slurm; `slurm-local` emulates the array on this machine."""
 
     def __init__(self, scheduler: str, workers: int, options: Mapping[str, str]) -> None:
         submitit = _extra("submitit")
@@ -147,10 +151,10 @@ class Slurm:
         except (AssertionError, NameError) as error:
             raise UserError(f"--slurm: {str(error).splitlines()[0]}") from None
 
-    def run(self, work: Work, jobs: list[Any], died: dict[Any, str]) -> Ticks:
+    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         futures = dict(zip(self._submit(work, jobs), jobs, strict=True))
         try:
-            yield from _wait(futures, lambda job: self._submit(work, [job])[0], died)
+            yield from _wait(futures, lambda job: self._submit(work, [job])[0], failures)
         finally:
             for task in futures:
                 if not task.done():
@@ -159,7 +163,7 @@ class Slurm:
     def _submit(self, work: Work, jobs: list[Any]) -> list[Any]:
         try:
             return list(self._executor.map_array(_on_slurm, [work] * len(jobs), jobs))
-        except Exception as error:  # submitit has no class of its own for what sbatch refuses
+        except Exception as error:  # submitit has no exception class for a refusal by sbatch
             raise UserError(f"--scheduler slurm: {' '.join(str(error).split())}") from None
 
 
@@ -170,25 +174,25 @@ def _extra(name: str) -> Any:
         raise UserError(f"--scheduler: {name} is not installed; run pip install 'nlt[cluster]'") from None
 
 
-def _wait(futures: dict[Any, Any], submit: Callable[[Any], Any], died: dict[Any, str]) -> Ticks:
-    """Until all are done: each returns what the user is to be told, or raises because it died."""
-    tried = set()
+def _wait(futures: dict[Any, Any], submit: Callable[[Any], Any], failures: dict[Any, str]) -> Ticks:
+    """Wait for all futures; each returns None or the message of a UserError, or raises because its worker died."""
+    retried = set()
     while futures:
         time.sleep(_POLL)
         yield None
         for future in [future for future in futures if future.done()]:
             job = futures.pop(future)
             try:
-                mistake = future.result()
-            except Exception as error:  # Dask and submitit each have their own for a lost worker
-                if job in tried:
-                    died[job] = " ".join(str(error).split())
+                message = future.result()
+            except Exception as error:  # Dask and submitit raise different classes for a lost worker
+                if job in retried:
+                    failures[job] = " ".join(str(error).split())
                 else:
-                    tried.add(job)
+                    retried.add(job)
                     futures[submit(job)] = job
                 continue
-            if mistake:
-                raise UserError(mistake)
+            if message:
+                raise UserError(message)
 
 
 def _on_dask(content: bytes, preload: tuple[str, ...]) -> str | None:
@@ -204,7 +208,8 @@ def _on_dask(content: bytes, preload: tuple[str, ...]) -> str | None:
 
 
 def _allow_children() -> None:
-    # Multiprocessing denies them to daemons, as Dask's workers and our processes are. Ours watch whether we live.
+    # Multiprocessing forbids children to daemons, which Dask's workers and our processes are. Our children end if their
+    # parent dies.
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
 
 
@@ -217,7 +222,7 @@ def _on_slurm(work: Work, job: Any) -> str | None:
 
 
 def _counter() -> Any:
-    # Without a lock, so that a killed process cannot leave one held.
+    # Without a lock, because a killed process could leave it held.
     return _CONTEXT.RawValue("q", 0)
 
 
@@ -226,22 +231,22 @@ def _work(content: bytes, threads: int, counter: Any) -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     _allow_children()
-    multiprocessing.set_start_method(None, force=True)  # else loaders' processes would start as this one did, slowly
+    multiprocessing.set_start_method(None, force=True)  # otherwise data loaders inherit our slow start method
 
     def tick(samples: int) -> None:
         if not parent.is_alive():
-            os._exit(1)  # the run was killed: nobody waits for this
+            os._exit(1)  # the parent was killed, so nobody needs the result
         counter.value += samples
 
     work(job, threads, tick)
 
 
-def _forking(preload: tuple[str, ...]) -> Any:
-    """A context whose processes are forked from one that has imported these modules and nothing else."""
+def _fork_context(preload: tuple[str, ...]) -> Any:
+    """Return a context whose processes are forked from a server that has only imported these modules."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(preload))
     before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # else it imports from elsewhere than we, before Python 3.13
+    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # before Python 3.13, the server ignores sys.path
     try:
         with as_the_user_said():
             forkserver.ensure_running()
@@ -254,10 +259,10 @@ def _forking(preload: tuple[str, ...]) -> Any:
 
 
 class Process:
-    """Calls a function in a process that ends afterwards, into which `preload` was imported once for all processes."""
+    """Calls a function in a new process; the `preload` modules are imported once for all processes."""
 
     def __init__(self, function: Callable, *arguments: Any, preload: tuple[str, ...] = ()) -> None:
-        context: Any = _forking(preload) if preload else _CONTEXT
+        context: Any = _fork_context(preload) if preload else _CONTEXT
         self._receive, send = context.Pipe(duplex=False)
         self._process = context.Process(target=_send_result, args=(send, function, arguments), daemon=True)
         self._process.start()
@@ -265,7 +270,7 @@ class Process:
         self.sentinel, self.is_alive, self.kill = self._process.sentinel, self._process.is_alive, self._process.kill
 
     def result(self) -> Any:
-        """What the function returned, once it has.
+        """Wait for the function and return its result.
 
         Raises:
             UserError: the function raised it.

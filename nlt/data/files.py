@@ -1,4 +1,4 @@
-"""Files of a dataset, on this machine or at any fsspec URL: written whole or not at all, read through a local cache."""
+"""Files of a dataset, local or at any fsspec URL: written atomically, and read through a local cache."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from upath import UPath
 from nlt.errors import UserError
 from nlt.paths import cache_root
 
-# A local path is a plain pathlib.Path, a URL a UPath, which is used alike.
+# A local path is a pathlib.Path; a URL is a UPath, which has the same interface.
 AnyPath = Path | UPath
 _HOST = platform.node().replace(".", "-")
 
 
 def open_path(place: str | AnyPath) -> AnyPath:
-    """A local path or an fsspec URL, such as s3://bucket/datasets.
+    """Return a path object for a local path or an fsspec URL such as s3://bucket/datasets.
 
     Raises:
-        UserError: no installed package knows the URL's protocol.
+        UserError: no installed package supports the URL's protocol.
     """
     if "://" not in str(place) or isinstance(place, UPath):
         return place if isinstance(place, UPath) else Path(place)
     try:
         path = UPath(str(place))
-        path.fs  # noqa: B018  imports what the protocol needs
+        path.fs  # noqa: B018  imports the protocol's package
     except (ImportError, ValueError) as error:
         raise UserError(f"data.root: {place}: {' '.join(str(error).split())}") from None
     return path
 
 
 def write_bytes(path: AnyPath, content: bytes) -> None:
-    """Write under a temporary name, then rename: a reader sees the whole file or none. To a URL, in one put.
+    """Write a file atomically: under a temporary name that is then renamed or, to a URL, in one put.
 
     Raises:
-        UserError: the disk is full. Nothing that was there is harmed.
+        UserError: the disk is full; an existing file is kept.
     """
     if isinstance(path, UPath):
         path.fs.makedirs(path.parent.path, exist_ok=True)
@@ -60,29 +60,29 @@ def write_bytes(path: AnyPath, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             need = len(content) / 1e6
-            raise UserError(f"{path}: no space left on disk ({need:.0f} MB needed); free some and run again") from None
+            raise UserError(f"{path}: no space left on disk ({need:.0f} MB needed); free space and run again") from None
         raise
 
 
 def _locked(temporary: Path) -> BinaryIO:
-    """Open a temporary file for writing and lock it; the lock ends with the file's closing or the process's death."""
+    """Open a temporary file for writing and lock it until it is closed or the process dies."""
     while True:
         file = temporary.open("wb")
-        with suppress(OSError):  # some network file systems have no locks
+        with suppress(OSError):  # some network file systems do not support locks
             fcntl.flock(file, fcntl.LOCK_EX)
         try:
             if os.path.samestat(os.fstat(file.fileno()), temporary.stat()):
                 return file
         except FileNotFoundError:
-            pass  # `remove_leftovers` came between opening and locking
+            pass  # `remove_leftovers` deleted the file before it was locked
         file.close()
 
 
 def remove_leftovers(directory: AnyPath) -> None:
     """Delete the temporary files whose writers on this machine are dead.
 
-    A writer that lives holds a lock on its file. Its process id would not tell: a killed process keeps it until its
-    parent notices, and the number may be used again. Files of other machines are left alone.
+    A live writer holds a lock on its file. Its process id is not reliable: a killed process keeps its id until the
+    parent notices, and ids are reused. Files of other machines are not touched.
     """
     for leftover in directory.glob(f"**/.*.{_HOST}.*.tmp") if isinstance(directory, Path) else ():
         with suppress(OSError), leftover.open("rb") as file:
@@ -91,28 +91,29 @@ def remove_leftovers(directory: AnyPath) -> None:
 
 
 def list_files(directory: AnyPath) -> set[str]:
-    """Every file below a directory, relative to it: one listing, not a question per file."""
+    """Return every file below a directory, relative to it, by one listing instead of one request per file."""
     if isinstance(directory, UPath):
-        directory.fs.invalidate_cache()  # other machines write too
+        directory.fs.invalidate_cache()  # other machines may have written files
         root = directory.path.rstrip("/") + "/"
         return {name.removeprefix(root) for name in directory.fs.find(root)}
     return {Path(top, name).relative_to(directory).as_posix() for top, _, names in os.walk(directory) for name in names}
 
 
 def local_copy(path: AnyPath, fresh: bool = False) -> Path:
-    """The file itself if it is local; of a URL, a copy in `NLT_CACHE` (default: ~/.cache/nlt), fetched once.
+    """Return a local file itself, or a copy of a URL in `NLT_CACHE` (default: ~/.cache/nlt) that is downloaded once.
 
     Args:
-        fresh: fetch it again.
+        path: the file.
+        fresh: download the file again.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
     """
     if not isinstance(path, UPath):
         return path
     key = hashlib.sha256(str(path).encode()).hexdigest()
     copy = cache_root() / key[:2] / f"{key}{path.suffix}"
     if fresh or not copy.exists():
-        # Not path.fs: a file system that is kept does not survive a fork, as of a loader's worker.
+        # path.fs would be a cached file system, which does not survive the fork of a data loader's worker.
         write_bytes(copy, fsspec.filesystem(path.protocol, **path.storage_options).cat_file(path.path))
     return copy

@@ -1,4 +1,4 @@
-"""Rendering a dataset: short-lived processes fill shards, here or on a cluster; what is there already is kept."""
+"""Dataset generation: short-lived processes, local or on a cluster, render the shards that do not exist yet."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from nlt.data.store import (
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 
-# Mitsuba's memory grows with every scene and state: a process renders so many samples and ends.
+# Mitsuba's memory grows with every scene and state, so a process ends after this many samples.
 SAMPLES_PER_JOB = 1024
-# Pilot views choose the samples per pixel of a scene's references: their number, and the samples per pixel of a half.
+# Number of pilot views per scene, and samples per pixel of each half of a pilot reference.
 PILOT_VIEWS, PILOT_SPP = 4, 32
 
 
 @dataclass(frozen=True)
 class Job:
-    """What one process renders: shards of a scene, and the scene's points if `points`."""
+    """The work of one process: shards of a scene and, if `points`, the scene's points."""
 
     scene: int
     shards: tuple[Shard, ...]
@@ -57,24 +57,25 @@ def generate(
     scheduler: str = "local",
     slurm: Mapping[str, str] | None = None,
 ) -> AnyPath:
-    """Render what is missing of a dataset and return its directory.
+    """Render the missing files of a dataset and return its directory.
 
-    Killed at any time and run again, it redoes at most the unfinished shards, with the same bytes. Two at a time
-    on the same directory do each other no harm.
+    After being killed at any time, another run renders only the unfinished shards, with the same bytes. Two concurrent
+    runs may use the same directory.
 
     Args:
-        root: of datasets: a directory or an fsspec URL, for several machines one that all of them see.
-        workers, scheduler, slurm: as `nlt.data.engines.find_engine`.
+        spec: the dataset's spec.
+        root: directory or fsspec URL of datasets; every machine that renders must be able to access it.
+        workers, scheduler, slurm: as in `nlt.data.engines.find_engine`.
 
     Raises:
-        UserError: a scene is wrong, a worker failed twice, or the disk has no room.
+        UserError: a scene is invalid, a worker died twice, or the disk is too small.
     """
     directory = spec.directory(root)
     missing = missing_files(directory, spec)
     if not missing and (directory / MANIFEST).exists():
         return directory
     if isinstance(directory, Path):
-        directory = directory.absolute()  # workers elsewhere have other working directories
+        directory = directory.absolute()  # workers on other machines have other working directories
     engine = find_engine(scheduler, workers, slurm or {})
     remove_leftovers(directory)
     variant = choose_variant()
@@ -92,10 +93,10 @@ def _shards(spec: DatasetSpec, missing: Iterable[str]) -> list[Shard]:
 
 
 def _choose_reference_spp(spec: DatasetSpec, directory: AnyPath, missing: Iterable[str]) -> None:
-    """Choose the samples per pixel of each scene's references and write them down.
+    """Choose the samples per pixel of each scene's references and store them.
 
-    This is done here, once and before any shard: samples of one scene, whose workers may run on different machines,
-    must all have the same number, and it must stay the same when a killed generation is resumed.
+    This happens once, before any shard is rendered, because all samples of a scene must have the same number, even if
+    workers run on different machines or a killed generation is resumed.
     """
     for scene, description in enumerate(spec.descriptions):
         if pilot_name(scene) not in missing:
@@ -103,19 +104,20 @@ def _choose_reference_spp(spec: DatasetSpec, directory: AnyPath, missing: Iterab
         try:
             mse = Process(_pilot, spec, scene).result()
         except Died as error:
-            raise UserError(f"{description.file}: the renderer died on a pilot view ({error})") from None
+            raise UserError(f"{description.file}: the renderer crashed on a pilot view ({error})") from None
         pilot = min(PILOT_SPP, spec.reference_spp)
         spp = needed_spp(spec, mse)
-        found = {"spp": spp, "predicted_mse": mse * pilot / spp, "pilot_spp": pilot, "pilot_mse": mse}
-        write_bytes(directory / pilot_name(scene), json.dumps(found, indent=1).encode())
-        most = ", the most that is allowed" if found["predicted_mse"] > spec.reference_mse else ""
-        print(f"{description.name}: references of 2 x {spp} spp{most}; predicted MSE {found['predicted_mse']:.1e}")
+        choice = {"spp": spp, "predicted_mse": mse * pilot / spp, "pilot_spp": pilot, "pilot_mse": mse}
+        write_bytes(directory / pilot_name(scene), json.dumps(choice, indent=1).encode())
+        limit = ", the maximum allowed" if choice["predicted_mse"] > spec.reference_mse else ""
+        print(f"{description.name}: references of 2 x {spp} spp{limit}; predicted MSE {choice['predicted_mse']:.1e}")
 
 
 def needed_spp(spec: DatasetSpec, mse: float) -> int:
-    """The samples per pixel at which halves whose MSE is `mse` on the pilot views reach `reference_mse`.
+    """Return the samples per pixel that reach `reference_mse`, given the `mse` between halves on the pilot views.
 
-    The MSE is taken to fall with the inverse of the samples per pixel. They are rounded up to a power of two.
+    The MSE is assumed to be inversely proportional to the samples per pixel, which are rounded up to a power of two and
+    limited to `reference_spp`.
     """
     pilot = min(PILOT_SPP, spec.reference_spp)
     needed = max(pilot, pilot * mse / spec.reference_mse)
@@ -123,8 +125,8 @@ def needed_spp(spec: DatasetSpec, mse: float) -> int:
 
 
 def _pilot(spec: DatasetSpec, scene: int) -> float:
-    """The MSE between two halves of a reference, as displayed: the mean over the pilot views of a scene."""
-    import torch  # not at the top, because processes that render samples do not need it
+    """Return the MSE between two reference halves as displayed, averaged over a scene's pilot views."""
+    import torch  # here, because processes that render samples do not need it
 
     from nlt.metrics.display import display
 
@@ -134,7 +136,7 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
     errors = []
     for k, (split, index) in enumerate(evaluated[:PILOT_VIEWS]):
         camera = render.place(split, index)
-        # No split has this number, so no sample has these seeds: the choice must not depend on the references' noise.
+        # No split has this index, so no sample shares these seeds: the choice must not depend on the references' noise.
         seeds = np.random.SeedSequence([spec.seed, len(SPLITS), scene, k]).generate_state(2)
         halves = torch.from_numpy(np.stack([render.radiance(camera, spp, int(seed)) for seed in seeds])).double()
         a, b = display(halves, render.description.exposure)
@@ -143,81 +145,80 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
 
 
 def _with_reference_spp(spec: DatasetSpec, spp: int) -> DatasetSpec:
-    """The spec with a fixed number of samples per pixel for its references, as `SampleRenderer` reads it."""
-    fixed = copy.copy(spec)  # unlike dataclasses.replace, this keeps the descriptions that the user's files gave
+    """Return a copy of the spec whose references have a fixed number of samples per pixel."""
+    fixed = copy.copy(spec)  # unlike dataclasses.replace, this keeps the loaded scene descriptions
     fixed.reference_spp, fixed.reference_mse = spp, 0.0
     return fixed
 
 
 def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine) -> None:
-    """Say what it will take before it starts; refuse what the disk cannot hold."""
+    """Print the expected size and time; raise UserError if the disk is too small."""
     samples = {split: sum(s.stop - s.start for s in shards if s.split == split) for split in SPLITS}
     size = sum(count * spec.nbytes(split) for split, count in samples.items())
     cost = f"{size / 1e9:.2f} GB"
     if isinstance(directory, Path):
         free = shutil.disk_usage(directory).free
         if size > free:
-            room = f"the dataset needs {size / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
+            room = f"the dataset needs {size / 1e9:.1f} GB, but only {free / 1e9:.1f} GB are free"
             raise UserError(f"{directory}: no space left on disk: {room}")
         cost += f" of {free / 1e9:.0f} GB free"
-    if isinstance(engine, Local):  # other machines may be faster or slower than this one
+    if isinstance(engine, Local):  # other machines may be faster or slower
         try:
             mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))
             train, evaluated = Process(_measure, _with_reference_spp(spec, mean)).result()
         except Died as error:
-            raise UserError(f"the renderer died while it was tried out ({error})") from None
+            raise UserError(f"the renderer crashed in a trial run ({error})") from None
         seconds = (samples["train"] * train + (samples["val"] + samples["test"]) * evaluated) / engine.workers
         cost += f", about {seconds / 60:.1f} min"
-    print(f"{directory}: {sum(samples.values())} samples to render, {engine.workers} side by side, {cost}", flush=True)
+    print(f"{directory}: {sum(samples.values())} samples to render, {engine.workers} at a time, {cost}", flush=True)
 
 
 def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
-    """The files that are missing, dealt out to jobs."""
+    """Divide the missing files into jobs."""
     jobs, shards = [], _shards(spec, missing)
     for scene in range(len(spec.scenes)):
-        mine = [shard for shard in shards if shard.scene == scene]
+        in_scene = [shard for shard in shards if shard.scene == scene]
         most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))
         points = points_name(scene) in missing
-        # Shards of evaluated splits cost more: deal them out.
-        count = -(-len(mine) // most)
-        parts = [mine[k::count] for k in range(count)] or [[]]
+        # Shards of evaluated splits cost more, so they are spread over the jobs.
+        count = -(-len(in_scene) // most)
+        parts = [in_scene[k::count] for k in range(count)] or [[]]
         jobs += [Job(scene, tuple(part), points and k == 0) for k, part in enumerate(parts) if part or points]
     return jobs
 
 
 def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) -> None:
-    """Run what is missing."""
-    left = lambda: sum(shard.stop - shard.start for shard in _shards(spec, missing_files(directory, spec)))
-    total, died = left(), dict[Job, str]()
+    remaining = lambda: sum(shard.stop - shard.start for shard in _shards(spec, missing_files(directory, spec)))
+    total, failures = remaining(), dict[Job, str]()
     jobs = plan(spec, missing_files(directory, spec), engine.workers)
     with (
         tqdm(total=total, unit="sample", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(engine.run(work, jobs, died)) as ticks,
+        closing(engine.run(work, jobs, failures)) as ticks,
     ):
         for ticked in ticks:
-            bar.update((total - left() if ticked is None else ticked) - bar.n)
-        bar.update(total - left() - bar.n)
-    for job, reason in died.items():
+            bar.update((total - remaining() if ticked is None else ticked) - bar.n)
+        bar.update(total - remaining() - bar.n)
+    for job, reason in failures.items():
         raise UserError(f"rendering {spec.scenes[job.scene]}: a worker died twice ({reason})")
     if missing := missing_files(directory, spec):
-        raise UserError(f"{directory}: still without {missing[0]}: do all machines see this directory?")
+        raise UserError(f"{directory}: {missing[0]} is still missing; check that all machines see this directory")
 
 
 def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int, tick: Callable[[int], None]) -> None:
-    """A job, in a process of its own."""
-    os.environ["NLT_VARIANT"] = variant  # the same on every machine
+    """Run a job in its own process."""
+    os.environ["NLT_VARIANT"] = variant  # every machine must use the same one
     directory = open_path(place)
     chosen = _with_reference_spp(spec, references(directory, spec)[job.scene]["spp"])
     fill(SampleRenderer(chosen, job.scene, threads), directory, job, tick)
 
 
 def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:
-    """Render a job of `render`'s scene and write it; `tick(n)` is called after every n samples."""
+    """Render and write the files of a job; `tick(n)` is called after every n samples."""
     if job.points:
         write_shard(directory / points_name(job.scene), [render.points()])
     for shard in job.shards:
         path = directory / shard.name
-        if path.exists():  # another run has been faster
+        if path.exists():  # another run has rendered it
             tick(shard.stop - shard.start)
         else:
             render_shard(render, path, shard, tick)
@@ -233,7 +234,7 @@ def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Call
 
 
 def _measure(spec: DatasetSpec) -> tuple[float, float]:
-    """Seconds for a training and for an evaluated sample, one worker, warm."""
+    """Return the seconds of a training sample and of an evaluated sample, with one thread after a warm-up."""
     render = SampleRenderer(spec, 0, 1)
     seconds = []
     for split in ("train", "test"):

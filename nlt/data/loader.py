@@ -1,4 +1,4 @@
-"""Batches read ahead by threads: read from mapped files, they need no process, and no memory shared with one."""
+"""A DataLoader that reads batches ahead in threads: mapped files need neither processes nor shared memory."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ _AHEAD = 2  # batches per thread
 
 
 class ThreadLoader(DataLoader):
-    """A DataLoader whose `num_workers` are threads; the same batches in the same order.
+    """A DataLoader whose `num_workers` are threads; it returns the same batches in the same order.
 
-    What reading does, copies, CRCs and arithmetic on whole arrays, runs without Python's lock. The first touch of
-    memory that processes share costs more than all of it: 0.8 ms per MB, measured on a virtual machine.
+    Reading consists of copies, CRCs and arithmetic on whole arrays, all of which run without Python's global
+    interpreter lock. The first access to memory shared between processes would cost more than all of them: 0.8 ms per
+    MB on a virtual machine.
     """
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         if self.num_workers == 0:
             yield from super().__iter__()
             return
-        # One thread each: torch's own, two per reader, would wait for one another, spinning.
+        # With more than one torch thread per reader, the threads would spin while they wait for each other.
         pool = ThreadPoolExecutor(self.num_workers, "reader", torch.set_num_threads, (1,))
         ahead: deque[Future] = deque()
         try:

@@ -1,4 +1,4 @@
-"""Training samples that are rendered while training, each for one step alone: their noise is never seen twice."""
+"""Training samples rendered during training. Each is used for one step only, so no noise is seen twice."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from nlt.rendering.variant import choose_variant
 
 
 class OnlineDataset(LightTransportDataset):
-    """An endless sequence of training samples, the scenes in turn; whoever asks for a number renders it.
+    """An endless sequence of training samples that alternates between the scenes; reading an index renders its sample.
 
-    With one scene, its beginning is what a stored set of the same seed holds.
+    With one scene, it begins with the samples of a stored dataset with the same seed.
 
     Args:
-        directory: of the dataset with the points.
-        spec: what it holds; in the states of its val and test samples, no training sample is rendered.
-        inputs: fields that the method reads, None for all; no others are rendered.
-        length: samples in an epoch.
-        threads: of each process that renders.
+        directory: directory of the dataset, for the points.
+        spec: the dataset's spec; training samples avoid the states of its val and test samples.
+        inputs: names of the fields that the method reads, None for all; only these are rendered.
+        length: samples per epoch.
+        threads: threads of each rendering process.
     """
 
     def __init__(
@@ -32,15 +32,15 @@ class OnlineDataset(LightTransportDataset):
         super().__init__(directory, spec, "train", inputs)
         self._length, self._threads = length, threads
         self._renderers: list[SampleRenderer] = []
-        choose_variant()  # once; the processes inherit it
+        choose_variant()  # here, so that all rendering processes inherit it
 
     def __len__(self) -> int:
         return self._length
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
         count = len(self.spec.scenes)
-        if not self._renderers:  # in the process that renders
-            # Threads are set with the last one: with one thread, loading a scene waits for ever.
+        if not self._renderers:  # created in the rendering process
+            # Only the last renderer sets the thread count, because loading a scene with one thread deadlocks.
             threads = [*[None] * (count - 1), self._threads]
             self._renderers = [SampleRenderer(self.spec, k, threads[k]) for k in range(count)]
         number, scene = divmod(index, count)

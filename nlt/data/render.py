@@ -1,4 +1,4 @@
-"""Renders the samples of a dataset, one at a time, each from its own seeds."""
+"""Rendering of a dataset's samples, one at a time, each from its own seeds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nlt.scenes.pointcloud import sample_points
 from nlt.scenes.state import rest_state
 from nlt.scenes.views import Views
 
-_TRIES = 3
+_ATTEMPTS = 3
 
 
 class SampleRenderer:
@@ -33,7 +33,7 @@ class SampleRenderer:
         threads: int | None = None,
         build: Callable[[SceneDescription, str], Scene] = Scene,
     ) -> None:
-        """`build` loads the scene: as its description and the experiment say, unless overridden."""
+        """Load the scene; `build` makes it from its description and the experiment."""
         use_variant()
         self.spec, self.index = spec, scene
         self.description = spec.descriptions[scene]
@@ -41,21 +41,21 @@ class SampleRenderer:
         self.renderer = Renderer(self.scene, spec.teacher)
         self.views = Views(self.scene)
         self._states: dict[str, Any] | None = None
-        self._taken: set[bytes] = set()  # states of the evaluated splits
+        self._taken: set[bytes] = set()  # keys of the states in the evaluated splits
         if threads:
-            dr.set_thread_count(threads)  # not earlier: see `use_variant`
+            dr.set_thread_count(threads)  # must not come earlier: see `use_variant`
 
     def points(self) -> dict[str, np.ndarray]:
-        """The scene's point cloud."""
+        """Return the scene's point cloud."""
         points = sample_points(self.scene, self.spec.points, self.spec.seed)
         share = float(points["area_share"])
-        print(f"{self.description.name}: points on the {share:.1%} of the surface that may be seen", flush=True)
+        print(f"{self.description.name}: points lie on the {share:.1%} of the surface that can be seen", flush=True)
         return points
 
     def place(self, split: str, index: int, rest: bool = False) -> Camera:
-        """Put the scene into the state of a sample and return the sample's camera.
+        """Put the scene into a sample's state, or into the rest state, and return the sample's camera.
 
-        Training samples go on after the last one that the spec counts, in states that val and test do not have.
+        An index beyond the spec's count gives a further sample, in a state that val and test do not contain.
         """
         spec = self.spec
         if rest:
@@ -73,13 +73,13 @@ class SampleRenderer:
     def sample(
         self, split: str, index: int, rest: bool = False, only: Collection[str] | None = None
     ) -> dict[str, np.ndarray]:
-        """One sample, all fields of its split or `only` some. `rest`: in the rest state, for trying out the speed."""
+        """Return one sample: all fields of its split, or those in `only`. `rest` takes the rest state, for timing."""
         camera = self.place(split, index, rest)
         fields = {name for name in self.spec.fields(split) if only is None or name in only}
         return self.view(camera, self.spec.seeds(split, self.index, index), fields)
 
     def view(self, camera: Camera, seeds: np.random.SeedSequence, names: Collection[str]) -> dict[str, np.ndarray]:
-        """The fields `names` of any view of the scene in its current state; images as large as the camera's."""
+        """Return the fields `names` of any view of the scene in its current state, at the camera's resolution."""
         spec, state = self.spec, self.scene.state
         noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds.generate_state(5))
         sizes = spec.sizes | {"H": camera.height, "W": camera.width}
@@ -110,13 +110,13 @@ class SampleRenderer:
         }
 
     def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
-        """Path-traced radiance (3, H, W), or (3, n) of `pixels` (n,), flat indices.
+        """Return path-traced radiance (3, H, W), W·sr⁻¹·m⁻², or (3, n) for the flat indices `pixels` (n,).
 
         Raises:
-            UserError: it is not finite, three times.
+            UserError: three attempts with different seeds gave values that are not finite.
         """
-        for attempt in range(_TRIES):
+        for attempt in range(_ATTEMPTS):
             image = self.renderer.radiance(camera, spp, (seed + attempt) % 2**32, pixels)
             if np.isfinite(image).all():
                 return image
-        raise UserError(f"{self.description.source}: the path tracer gives non-finite radiance at seed {seed}")
+        raise UserError(f"{self.description.source}: the integrator gives non-finite radiance at seed {seed}")

@@ -1,4 +1,4 @@
-"""What a dataset is made of, where it lies, and which states its splits hold."""
+"""The spec of a dataset: its content, its directory and the states in its splits."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from nlt.errors import UserError
 from nlt.scenes.description import EXPERIMENTS, TEACHERS, Experiment, SceneDescription, Teacher, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 3  # of the files on disk
-# Keys of a config file, and of its section `data`: the arguments of LightTransportDataModule.
+FORMAT = 3  # version of the files on disk
+# Keys of a config file, and of its `data` section, which has the arguments of LightTransportDataModule.
 SECTIONS = ("data", "model", "trainer", "seed_everything")
 DATA = ("dataset", "root", "batch_size", "workers", "seed", "online", "train_images")
-_DRAWS = 1000  # of a state that no other split has
+_DRAWS = 1000  # attempts to find a state that no other split has
 
 
 @dataclass
 class DatasetSpec:
-    """A dataset: of which scenes, in which experiment, how large. Counts of samples are per scene.
+    """The scenes, the experiment and the size of a dataset. Sample counts are per scene.
 
     Args:
         scenes: names in configs/scenes, or paths of scene.yaml files.
         experiment: static, fixed_lights (Table 1) or moving_lights (Table 2).
         resolution: height and width of the images in pixels.
-        train: training samples per scene; of online training, in an epoch.
+        train: training samples per scene; with online training, per scene and epoch.
         val: validation samples per scene.
         test: test samples per scene.
         points: surface points per scene.
         photons: photons per sample.
         noisy_spp: samples per pixel of the training target.
         input_spp: samples per pixel of the denoisers' input.
-        reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the most.
-        reference_mse: how large the MSE between the two halves may be, as displayed (sRGB at the scene's exposure).
-            A few pilot views of each scene choose the samples per pixel that reach it. With 0, it is `reference_spp`.
-        seed: of everything random in it.
+        reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the maximum.
+        reference_mse: target MSE between the two halves as displayed (sRGB at the scene's exposure). A few pilot views
+            of each scene determine the samples per pixel that reach it. With 0, `reference_spp` is used.
+        seed: seed of everything random in the dataset.
         shard_size: samples per file.
-        teacher: the integrator of noisy, noisy_input and reference; "scene": the one that scene.yaml names.
+        teacher: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
     """
 
     scenes: list[str]
@@ -85,40 +85,40 @@ class DatasetSpec:
         mse = self.reference_mse
         if isinstance(mse, bool) or not isinstance(mse, int | float) or not 0 <= mse < math.inf:
             raise UserError(f"{at}.reference_mse: must be a number of at least 0, written as 1.0e-4, is {mse!r}")
-        self.reference_mse = float(mse)  # 0 and 0.0 name the same directory
+        self.reference_mse = float(mse)  # so that 0 and 0.0 give the same directory
 
     @cached_property
     def descriptions(self) -> list[SceneDescription]:
-        """Of the scenes, in order."""
+        """The descriptions of the scenes, in order."""
         return [load_description(name) for name in self.scenes]
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The numbers behind the symbols in the shapes of `FIELDS`."""
+        """The sizes that the symbols in the shapes of `FIELDS` stand for."""
         most = max(len(d.movables(self.experiment)) for d in self.descriptions)
         return {"H": self.resolution, "W": self.resolution, "P": self.photons, "N": self.points, "M": most}
 
     def fields(self, split: str) -> dict[str, Field]:
-        """What a sample of this split stores."""
+        """Return the fields that a sample of this split stores."""
         return {name: f for name, f in FIELDS.items() if split != "train" or not f.reference_only}
 
     def count(self, split: str) -> int:
-        """Samples per scene."""
+        """Return the number of samples per scene in a split."""
         return int(getattr(self, split))
 
     def nbytes(self, split: str) -> int:
-        """Bytes on disk of one sample."""
+        """Return the size of one sample on disk in bytes."""
         sizes = self.sizes
         return sum(field.nbytes(sizes) for field in self.fields(split).values())
 
     @property
     def has_pilots(self) -> bool:
-        """Whether pilot views choose how many samples per pixel the references have."""
+        """Whether pilot views determine the samples per pixel of the references."""
         return self.reference_mse > 0 and self.val + self.test > 0
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """Everything that decides the dataset's content."""
+        """Everything that determines the dataset's content."""
         from nlt import __version__
 
         return {
@@ -131,18 +131,18 @@ class DatasetSpec:
         }
 
     def directory(self, root: str | AnyPath) -> AnyPath:
-        """Where the dataset lies: a name that says what it is, and a hash of the spec and the scenes' files."""
+        """Return the dataset's directory, named by its main properties and a hash of the spec and the scene files."""
         content = {k: v for k, v in self.manifest.items() if k in ("format", "spec", "scenes")}
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
         names = "+".join(d.name for d in self.descriptions[:4])
         return open_path(root) / f"{self.experiment}-{names}-{self.resolution}-{digest}"
 
     def without_train(self) -> DatasetSpec:
-        """What online training stores of it: its samples for validation and test, and its points."""
+        """Return the spec of what online training stores: points, validation and test samples."""
         return dataclasses.replace(self, train=0)
 
     def shards(self) -> list[Shard]:
-        """Every shard of the dataset, the evaluated splits first."""
+        """Return every shard of the dataset, the evaluated splits first."""
         return [
             self.shard(split, scene, start)
             for split in reversed(SPLITS)
@@ -151,16 +151,16 @@ class DatasetSpec:
         ]
 
     def shard(self, split: str, scene: int, row: int) -> Shard:
-        """The shard that holds a scene's sample `row`."""
+        """Return the shard that contains sample `row` of a scene."""
         start = row - row % self.shard_size
         return Shard(split, scene, start, min(start + self.shard_size, self.count(split)))
 
     def seeds(self, split: str, scene: int, index: int) -> np.random.SeedSequence:
-        """The seeds of one sample."""
+        """Return the seeds of one sample."""
         return np.random.SeedSequence([self.seed, SPLITS.index(split), scene, index])
 
     def states(self, scene: int) -> dict[str, list[SceneState]]:
-        """The state of every sample of a scene. No state is in two splits, unless nothing can move."""
+        """Return the states of a scene's samples by split. No state is in two splits, unless nothing can move."""
         taken: set[bytes] = set()
         states: dict[str, list[SceneState]] = {}
         for split in reversed(SPLITS):
@@ -169,20 +169,24 @@ class DatasetSpec:
         return states
 
     def state(self, split: str, scene: int, index: int, taken: Collection[bytes]) -> SceneState:
-        """The state of one sample, of whatever index, that is none of those `taken` by other splits."""
+        """Return the state of one sample, also beyond the spec's count, avoiding the states `taken` by other splits.
+
+        Raises:
+            UserError: no free state was found; the boxes of the scene's objects are too small.
+        """
         description = self.descriptions[scene]
         rng = np.random.default_rng(self.seeds(split, scene, index).spawn(1)[0])
-        # With every object removed, two states are equal.
+        # States can coincide, for example if every object is removed.
         for _ in range(_DRAWS):
             state = sample_state(description, self.experiment, rng)
             if not len(state.present) or state.key not in taken:
                 return state
-        raise UserError(f"{description.file}: objects: too few states for three splits; widen a box")
+        raise UserError(f"{description.file}: objects: too few different states for three splits; enlarge a box")
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Samples start..stop of one scene in one split, in one file."""
+    """A file with the samples from `start` to before `stop` of one scene in one split."""
 
     split: str
     scene: int
@@ -191,12 +195,12 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """File name, relative to the dataset's directory."""
+        """The file's name, relative to the dataset's directory."""
         return f"{self.split}/{self.scene:03d}-{self.start:07d}.safetensors"
 
 
 def read_configs(files: list[str]) -> dict[str, Any]:
-    """Merge YAML configs, later ones over earlier ones.
+    """Merge YAML configs; later files override earlier ones.
 
     Raises:
         UserError: a file is missing or is not YAML.
@@ -216,7 +220,7 @@ def read_configs(files: list[str]) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`over` upon `base`, mapping by mapping."""
+    """Return `base` overridden by `over`, merging nested mappings."""
     both = {
         k: merge(base[k], v) for k, v in over.items() if isinstance(v, Mapping) and isinstance(base.get(k), Mapping)
     }
@@ -224,7 +228,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], needed: Collection[str] = ()) -> None:
-    """Raises UserError if a key of a config's section is not known, or one that is needed is missing."""
+    """Raise UserError if a config section has an unknown key or lacks a required one."""
     for key in content:
         if key not in known:
             raise UserError(f"{place}{key}: unknown key; known are {', '.join(known)}")
@@ -234,18 +238,22 @@ def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], n
 
 
 def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
-    """The dataset that config files describe, without what is rendered online; the root directory of datasets."""
+    """Return the dataset in config files, without training samples that are rendered online, and the root of datasets.
+
+    Raises:
+        UserError: a file cannot be read, or has an unknown, missing or invalid key.
+    """
     where = " + ".join(files)
     merged = read_configs(files)
     data = merged.get("data")
     if not isinstance(data, Mapping) or not isinstance(data.get("dataset"), Mapping):
-        raise UserError(f"{where}: data.dataset: missing; add a config of configs/data")
+        raise UserError(f"{where}: data.dataset: missing; add a config from configs/data")
     dataset = tuple(field.name for field in dataclasses.fields(DatasetSpec))
     sections = (("", merged, SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
     for section, content, known in sections:
         check_keys(f"{where}: {section}", content, known)
     if "scenes" not in data["dataset"]:
-        raise UserError(f"{where}: data.dataset.scenes: missing; add a config of configs/data")
+        raise UserError(f"{where}: data.dataset.scenes: missing; add a config from configs/data")
     spec, online = DatasetSpec(**data["dataset"]), data.get("online", False)
     if not isinstance(online, bool):
         raise UserError(f"{where}: data.online: must be true or false, is {online!r}")

@@ -1,4 +1,4 @@
-"""`nlt data stats`: what a sample costs by field, and what the paper's full dataset would cost here."""
+"""`nlt data stats`: the cost of a sample by field, and the estimated cost of the paper's dataset on this machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
 from nlt.paths import CONFIGS
 
-# What is rendered at once, and the fields that come of it.
+# Rendering stages of a sample, and the fields that each stage produces.
 STAGES = {
     "state, view": ("camera_matrix", "world_to_view", "translation", "present"),
     "noisy": ("noisy",),
@@ -32,18 +32,18 @@ STAGES = {
     "storing": (),
 }
 _WARM_UP, _SAMPLES = 2, 4
-_MOST_SPP = 8  # of a reference that is timed
+_MOST_SPP = 8  # maximum samples per pixel of a timed reference
 
 
 def stats(place: str, workers: int | None = None) -> str:
-    """A report: bytes by field of a dataset, seconds by field at its size and at the paper's, the paper's cost.
+    """Return a report of bytes and seconds by field, at the dataset's and at the paper's size, with total costs.
 
-    Bytes follow from the manifest. Seconds are measured now, in `workers` processes side by side, warm, the mean over
-    all scenes; a reference of more than 8 spp is measured at 8 and extrapolated in proportion. The dataset's references
-    count with the samples per pixel that its pilot views chose, those at the paper's size with the most allowed.
+    Bytes follow from the manifest. Seconds are measured in `workers` concurrent processes after a warm-up and averaged
+    over all scenes. A reference with more than 8 spp is timed at 8 spp and extrapolated linearly. The dataset's
+    references count with the samples per pixel chosen from pilot views, the paper's with the maximum allowed.
 
     Raises:
-        UserError: there is no dataset, or the renderer dies.
+        UserError: there is no dataset, or the renderer crashes.
     """
     spec = read_spec(open_path(place))
     spp = [reference["spp"] for reference in references(open_path(place), spec)]
@@ -62,8 +62,8 @@ def stats(place: str, workers: int | None = None) -> str:
             sizes = "".join(f"{s.fields('test')[name].nbytes(s.sizes):>{w},}" for s, w in ((spec, 10), (paper, 15)))
             lines.append(f"{name if len(fields) == 1 else '  ' + name:18}{sizes}{timed if len(fields) == 1 else ''}")
     lines += [
-        f"Seconds: {workers} processes side by side, {_SAMPLES} samples each after {_WARM_UP} in each "
-        f"scene; references at {_MOST_SPP} spp at most, extrapolated in proportion. "
+        f"Seconds are measured in {workers} concurrent processes, each with {_SAMPLES} samples per scene after "
+        f"{_WARM_UP} for warm-up; references are timed at up to {_MOST_SPP} spp and extrapolated linearly. "
         f"Totals are extrapolated from these samples.",
         _cost("this dataset", spec, ours, workers),
         _cost("the paper's", paper, theirs, workers),
@@ -72,58 +72,59 @@ def stats(place: str, workers: int | None = None) -> str:
 
 
 def _cost(name: str, spec: DatasetSpec, seconds: dict[str, float], workers: int) -> str:
-    """Of all scenes in total."""
-    evaluated = sum(seconds[stage] for stage in STAGES)
-    train = evaluated - seconds["reference"]
-    scenes, judged = len(spec.scenes), spec.val + spec.test
-    processes = -(-(spec.train + judged) // SAMPLES_PER_JOB)
-    hours = (spec.train * train + judged * evaluated + processes * seconds["start"]) / workers / 3600
-    size = spec.train * spec.nbytes("train") + judged * spec.nbytes("test")
+    """Return a line with the total time and size of all scenes."""
+    per_evaluated = sum(seconds[stage] for stage in STAGES)
+    per_train = per_evaluated - seconds["reference"]
+    scenes, evaluated = len(spec.scenes), spec.val + spec.test
+    processes = -(-(spec.train + evaluated) // SAMPLES_PER_JOB)
+    hours = (spec.train * per_train + evaluated * per_evaluated + processes * seconds["start"]) / workers / 3600
+    size = spec.train * spec.nbytes("train") + evaluated * spec.nbytes("test")
     return (
-        f"{name}: {scenes} scenes x ({spec.train:,} + {judged:,}) samples of {spec.resolution}x{spec.resolution}: "
-        f"{scenes * hours:.2f} h with {workers} workers ({1e3 * train:.0f} ms a training sample, "
-        f"{1e3 * evaluated:.0f} ms an evaluated one, {seconds['start']:.1f} s to start a process), "
+        f"{name}: {scenes} scenes x ({spec.train:,} + {evaluated:,}) samples of {spec.resolution}x{spec.resolution}: "
+        f"{scenes * hours:.2f} h with {workers} workers ({1e3 * per_train:.0f} ms per training sample, "
+        f"{1e3 * per_evaluated:.0f} ms per evaluated sample, {seconds['start']:.1f} s to start a process), "
         f"{scenes * size / 1e9:.2f} GB"
     )
 
 
 def _measure(spec: DatasetSpec, spp: list[int], workers: int, bar: tqdm) -> dict[str, float]:
-    """Mean seconds per sample by stage, and `start`: what a process costs besides its samples.
+    """Return the mean seconds per sample by stage and, as `start`, the seconds that a process needs to start.
 
-    `spp`: the samples per pixel of each half of a scene's references, by scene.
+    `spp` lists the samples per pixel of each reference half by scene.
     """
     results = []
     for scene in range(len(spec.scenes)):
-        few = replace(spec, train=_WARM_UP + _SAMPLES, val=0, test=0, reference_spp=spp[scene])
+        trial = replace(spec, train=_WARM_UP + _SAMPLES, val=0, test=0, reference_spp=spp[scene])
         try:
             runs = [
-                Process(_time, few, scene, max(1, available_cpus() // workers), time.time()) for _ in range(workers)
+                Process(_time_samples, trial, scene, max(1, available_cpus() // workers), time.time())
+                for _ in range(workers)
             ]
             results += [run.result() for run in runs]
         except Died as error:
-            raise UserError(f"the renderer died while it was tried out ({error})") from None
+            raise UserError(f"the renderer crashed in a trial run ({error})") from None
         bar.update()
     return {stage: float(np.mean([result[stage] for result in results])) for stage in results[0]}
 
 
-def _time(spec: DatasetSpec, scene: int, threads: int, began: float) -> dict[str, float]:
+def _time_samples(spec: DatasetSpec, scene: int, threads: int, launched: float) -> dict[str, float]:
     render = SampleRenderer(spec, scene, threads)
     sample = render.sample("train", 0)
     with tempfile.TemporaryDirectory() as folder:
         frames = [laps(render, k, lambda: write_shard(Path(folder) / "shard", [sample])) for k in range(spec.train)]
     seconds = {stage: float(np.mean([frame[stage] for frame in frames[_WARM_UP:]])) for stage in STAGES}
-    start = time.time() - began - sum(seconds.values()) * len(frames)
+    start = time.time() - launched - sum(seconds.values()) * len(frames)
     seconds["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
     return seconds | {"start": start}
 
 
 def timed_spp(spec: DatasetSpec) -> int:
-    """Samples per pixel at which the reference is timed; its seconds are in proportion."""
+    """Return the samples per pixel at which the reference is timed; its seconds are extrapolated linearly."""
     return min(spec.reference_spp, _MOST_SPP)
 
 
 def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str, float]:
-    """Seconds by stage of a training sample, and of one half of a reference at `timed_spp`; `store` is timed too."""
+    """Return the seconds by stage of a training sample, of one reference half at `timed_spp`, and of `store`."""
     spec, trace = render.spec, render.renderer
     seconds: dict[str, float] = {}
 

@@ -1,4 +1,4 @@
-"""Samples on disk: stacked safetensors shards with a CRC per sample and field, written whole or not at all."""
+"""Samples on disk: stacked safetensors shards with a CRC per sample and field, written atomically."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Points = dict[str, np.ndarray]  # a scene's point cloud, by field
 
 
 def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
-    """Stack samples field by field into one file."""
+    """Write samples to one file, stacked field by field."""
     arrays: dict[str, np.ndarray] = {}
     for name in sorted(samples[0]):
         stack = np.stack([sample[name] for sample in samples])
@@ -38,7 +38,7 @@ def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
 
 
 class ShardReader:
-    """Random access to samples; keeps the files it has read mapped into memory. For threads, and after a fork."""
+    """Random access to samples through memory-mapped files. It works in threads and after a fork."""
 
     def __init__(self) -> None:
         self._files: OrderedDict[AnyPath, dict[str, np.ndarray]] = OrderedDict()
@@ -48,8 +48,9 @@ class ShardReader:
         return ShardReader, ()
 
     def read(self, path: AnyPath, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
-        """The fields of one sample of a shard: views of the file in memory. A damaged copy of a remote file is fetched
-        once more.
+        """Return fields of one sample of a shard as views of the mapped file.
+
+        If the local copy of a remote file is damaged, it is downloaded once more.
 
         Raises:
             UserError: the shard is missing, truncated, or fails its CRC.
@@ -62,7 +63,7 @@ class ShardReader:
                 raise
         with self._lock:
             self._files.pop(path, None)
-        with suppress(FileNotFoundError):  # said by the next line
+        with suppress(FileNotFoundError):  # the next line reports it
             local_copy(path, fresh=True)
         return self._read(path, row, fields)
 
@@ -87,7 +88,7 @@ class ShardReader:
             self.__init__()  # type: ignore[misc]
         with self._lock:
             if path not in self._files:
-                with safe_open(local_copy(path), framework="pt") as file:  # which, unlike "numpy", copies nothing
+                with safe_open(local_copy(path), framework="pt") as file:  # copies nothing, unlike "numpy"
                     self._files[path] = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
                 if len(self._files) > _OPEN_FILES:
                     self._files.popitem(last=False)
@@ -96,35 +97,35 @@ class ShardReader:
 
 
 def read_points(path: AnyPath) -> Points:
-    """The point cloud of a scene: all of `POINT_FIELDS`."""
+    """Return the point cloud of a scene, with all `POINT_FIELDS`."""
     return ShardReader().read(path, 0, POINT_FIELDS)
 
 
 def points_crc(points: Points) -> int:
-    """Equal for the same points in the same order, which is what learned embeddings are of."""
+    """Return a checksum of the points and their order, to which learned embeddings belong."""
     return zlib.crc32(points["position"].tobytes())
 
 
 def points_name(scene: int) -> str:
-    """The file with a scene's points, relative to the dataset's directory."""
+    """Return the name of the file with a scene's points, relative to the dataset's directory."""
     return f"points-{scene:03d}.safetensors"
 
 
 def pilot_name(scene: int) -> str:
-    """The file with what the pilot views of a scene chose, relative to the dataset's directory."""
+    """Return the name of the file with a scene's pilot result, relative to the dataset's directory."""
     return f"pilot-{scene:03d}.json"
 
 
 def read_pilot(directory: AnyPath, scene: int) -> dict[str, Any]:
-    """What the pilot views of a scene chose: `spp`, and the MSE between the reference's halves that it predicts.
+    """Return the pilot result of a scene: `spp`, and the `predicted_mse` between the reference's halves.
 
     Raises:
         UserError: the file is missing or damaged.
     """
     path = directory / pilot_name(scene)
     try:
-        found = json.loads(path.read_text())
-        return {"spp": int(found["spp"]), "predicted_mse": float(found["predicted_mse"])}
+        content = json.loads(path.read_text())
+        return {"spp": int(content["spp"]), "predicted_mse": float(content["predicted_mse"])}
     except FileNotFoundError:
         raise UserError(f"{path}: missing; run `nlt generate` again") from None
     except (ValueError, KeyError, TypeError) as error:
@@ -132,64 +133,64 @@ def read_pilot(directory: AnyPath, scene: int) -> dict[str, Any]:
 
 
 def references(directory: AnyPath, spec: DatasetSpec) -> list[dict[str, Any]]:
-    """By scene `spp`, the samples per pixel of each half of a reference; with pilot views also what they predict."""
+    """Return, by scene, the samples per pixel `spp` of each reference half; with pilot views, also `predicted_mse`."""
     scenes = range(len(spec.scenes))
     return [read_pilot(directory, k) if spec.has_pilots else {"spp": spec.reference_spp} for k in scenes]
 
 
 def write_manifest(directory: AnyPath, spec: DatasetSpec, variant: str) -> None:
-    """Record what the dataset is made of and what rendered it; the same two write the same bytes."""
+    """Write the dataset's content and the Mitsuba variant; equal arguments write equal bytes."""
     write_bytes(directory / MANIFEST, json.dumps(spec.manifest | {"variant": variant}, indent=1).encode())
 
 
 def dataset_files(spec: DatasetSpec) -> list[str]:
-    """Pilots' choices, point clouds and shards of a dataset, relative to its directory."""
+    """Return the names of all pilot results, point clouds and shards of a dataset, relative to its directory."""
     scenes = range(len(spec.scenes))
     pilots = [pilot_name(k) for k in scenes] if spec.has_pilots else []
     return pilots + [points_name(k) for k in scenes] + [shard.name for shard in spec.shards()]
 
 
 def missing_files(directory: AnyPath, spec: DatasetSpec) -> list[str]:
-    """Those of `dataset_files` that are not there yet."""
-    there = list_files(directory)
-    return [name for name in dataset_files(spec) if name not in there]
+    """Return those of `dataset_files` that do not exist yet."""
+    existing = list_files(directory)
+    return [name for name in dataset_files(spec) if name not in existing]
 
 
 def read_manifest(directory: AnyPath) -> dict[str, Any]:
-    """What a dataset's manifest says.
+    """Return the content of a dataset's manifest.
 
     Raises:
-        UserError: there is none, or it is damaged.
+        UserError: the manifest is missing or damaged.
     """
     path = directory / MANIFEST
     advice = "run `nlt generate` with the same --config files"
     try:
         return dict(json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"{directory}: no dataset here; {advice}, it prints the directory that it fills") from None
+        raise UserError(f"{directory}: no dataset here; {advice}, which prints the directory that it fills") from None
     except (ValueError, TypeError) as error:
         raise UserError(f"{path}: damaged manifest ({error}); delete it and {advice}") from None
 
 
 def read_spec(directory: AnyPath) -> DatasetSpec:
-    """The spec in a dataset's manifest."""
+    """Return the spec in a dataset's manifest; raise UserError if this version cannot read it."""
     try:
         return DatasetSpec(**read_manifest(directory)["spec"])
     except (KeyError, TypeError) as error:
-        raise UserError(f"{directory / MANIFEST}: spec: not one of this version ({error}); generate it again") from None
+        raise UserError(f"{directory / MANIFEST}: spec: not of this version ({error}); generate it again") from None
 
 
 def check_dataset(directory: AnyPath, spec: DatasetSpec) -> None:
-    """Refuse anything but a complete dataset of `spec`.
+    """Check that a directory holds the complete dataset of `spec`.
 
     Raises:
-        UserError: it is missing, incomplete, or holds something else than `spec` asks for.
+        UserError: the dataset is missing, incomplete or has another spec.
     """
     manifest, advice = read_manifest(directory), "run `nlt generate` with the same --config files"
     for key, value in spec.manifest.items():
         if key != "nlt" and manifest.get(key) != value:
             place = directory / MANIFEST
-            raise UserError(f"{place}: {key}: is not what the config asks for; delete {directory} and {advice}")
+            raise UserError(f"{place}: {key}: does not match the config; delete {directory} and {advice}")
     missing = missing_files(directory, spec)
     if missing:
         raise UserError(f"{directory}: incomplete, {len(missing)} files missing, such as {missing[0]}; {advice}")

@@ -1,4 +1,4 @@
-"""`nlt data verify`: reads every byte of a dataset and says all that is wrong with it."""
+"""`nlt data verify`: reads every byte of a dataset and reports everything that is wrong with it."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ _RADIANCE = ("noisy", "noisy_input", "reference_a", "reference_b")
 
 
 def verify(place: str) -> None:
-    """Check a dataset and print what is wrong, a line each: files that are missing, that do not belong there, that
-    fail a CRC or are not of the declared form; values that are not finite; images that show nothing; states that
-    two splits share. Changes nothing.
+    """Check a dataset and print one line per finding; nothing is changed.
+
+    Findings are missing and unexpected files, CRC failures, wrong field names, shapes or dtypes, values that are not
+    finite, black or constant images, and states that two splits share.
 
     Raises:
-        UserError: something is wrong; a summary of what was printed.
+        UserError: there is no dataset, or there are findings; the message gives their number.
     """
     directory = open_path(place)
-    spec, there = read_spec(directory), list_files(directory)
-    wanted = dataset_files(spec)
+    spec, existing = read_spec(directory), list_files(directory)
+    expected = dataset_files(spec)
     findings = _check_manifest(directory, spec)
-    findings += [f"{name}: missing" for name in wanted if name not in there]
-    findings += [f"{name}: not part of the dataset" for name in sorted(there - {MANIFEST, *wanted})]
-    findings += _check_pilots(directory, spec, there)
-    tasks: list[Shard | int] = [k for k in range(len(spec.scenes)) if points_name(k) in there]
-    tasks += [shard for shard in spec.shards() if shard.name in there]
+    findings += [f"{name}: missing" for name in expected if name not in existing]
+    findings += [f"{name}: not part of the dataset" for name in sorted(existing - {MANIFEST, *expected})]
+    findings += _check_pilots(directory, spec, existing)
+    tasks: list[Shard | int] = [k for k in range(len(spec.scenes)) if points_name(k) in existing]
+    tasks += [shard for shard in spec.shards() if shard.name in existing]
     states: dict[tuple[int, str], set[bytes]] = {}
     with ThreadPoolExecutor(available_cpus()) as pool:
         check = lambda task: _check_shard(directory, spec, task)
@@ -59,15 +60,15 @@ def verify(place: str) -> None:
 def _check_manifest(directory: AnyPath, spec: DatasetSpec) -> list[str]:
     manifest, now = read_manifest(directory), spec.manifest
     return [
-        f"{MANIFEST}: {key}: is not what its spec and the scenes' files give now"
+        f"{MANIFEST}: {key}: does not match the spec and the current scene files"
         for key in ("format", "scenes", "exposure", "shards")
         if manifest.get(key) != now[key]
     ]
 
 
-def _check_pilots(directory: AnyPath, spec: DatasetSpec, there: set[str]) -> Iterable[str]:
+def _check_pilots(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -> Iterable[str]:
     for scene in range(len(spec.scenes)):
-        if spec.has_pilots and pilot_name(scene) in there:
+        if spec.has_pilots and pilot_name(scene) in existing:
             try:
                 read_pilot(directory, scene)
             except UserError as error:
@@ -76,21 +77,21 @@ def _check_pilots(directory: AnyPath, spec: DatasetSpec, there: set[str]) -> Ite
 
 @dataclass
 class _File:
-    """What is wrong with a file, and the states of its samples."""
+    """A file's arrays and findings, and the states of its samples."""
 
     name: str
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     findings: list[str] = field(default_factory=list)
     states: set[bytes] = field(default_factory=set)
 
-    def say(self, name: str, wrong: np.ndarray, what: str) -> None:
-        """`wrong` (n,) bool: which samples."""
+    def report(self, name: str, wrong: np.ndarray, problem: str) -> None:
+        """Add a finding about the samples that the mask `wrong` (n,) selects."""
         if wrong.any():
-            self.findings.append(f"{self.name}: {name}: sample {', '.join(map(str, np.flatnonzero(wrong)))}: {what}")
+            self.findings.append(f"{self.name}: {name}: sample {', '.join(map(str, np.flatnonzero(wrong)))}: {problem}")
 
 
 def _check_shard(directory: AnyPath, spec: DatasetSpec, task: Shard | int) -> _File:
-    """Of a shard, or of the points of a scene."""
+    """Check a shard or, if `task` is a scene's index, that scene's points."""
     points = isinstance(task, int)
     file = _File(points_name(task) if isinstance(task, int) else task.name)
     try:
@@ -108,39 +109,44 @@ def _check_shard(directory: AnyPath, spec: DatasetSpec, task: Shard | int) -> _F
 
 
 def _check_form(file: _File, fields: Mapping[str, Field], count: int, sizes: dict[str, int]) -> bool:
-    """Names, shapes, dtypes, CRCs, finite values. Whether all fields are there in their form."""
+    """Check names, shapes, dtypes, CRCs and finite values; return whether every array has its declared form."""
     declared = {name: ((count, *f.resolve(sizes)), f.dtype) for name, f in fields.items()}
     declared |= {CRC + name: ((count,), "uint32") for name in fields}
-    found = {name: (array.shape, array.dtype.name) for name, array in file.arrays.items()}
-    wrong = [name for name in {**declared, **found} if declared.get(name) != found.get(name)]
-    file.findings += [f"{file.name}: {n}: is {found.get(n, 'missing')}, not {declared.get(n, 'there')}" for n in wrong]
+    actual = {name: (array.shape, array.dtype.name) for name, array in file.arrays.items()}
+    wrong = [name for name in {**declared, **actual} if declared.get(name) != actual.get(name)]
+    file.findings += [
+        f"{file.name}: {name}: is {actual.get(name, 'missing')}, not {declared.get(name, 'declared')}" for name in wrong
+    ]
     for name in [name for name in fields if name not in wrong and CRC + name not in wrong]:
         array = file.arrays[name]
         sums = np.array([zlib.crc32(row.tobytes()) for row in array], np.uint32)
-        file.say(name, sums != file.arrays[CRC + name], "fails its CRC")
-        file.say(name, ~np.isfinite(array.reshape(count, -1)).all(1), "not finite")
+        file.report(name, sums != file.arrays[CRC + name], "fails its CRC")
+        file.report(name, ~np.isfinite(array.reshape(count, -1)).all(1), "not finite")
     return not wrong
 
 
 def _check_images(file: _File) -> None:
-    """A reference shows something, and so do the noisy images of a sample together: one with few samples per pixel
-    may miss every light by itself. A camera in the room sees the room."""
+    """Check that the images are not black or constant and that the camera sees a surface.
+
+    With few samples per pixel, one noisy image may miss every light, so a sample fails only if both of its noisy images
+    do.
+    """
     flat = {
         name: (image == image[..., :1, :1]).reshape(len(image), -1).all(1)
         for name, image in file.arrays.items()
         if name in _RADIANCE
     }
     for name in sorted(flat.keys() - {"noisy", "noisy_input"}):
-        file.say(name, flat[name], "black or constant")
-    file.say("noisy, noisy_input", flat["noisy"] & flat["noisy_input"], "both black or constant")
+        file.report(name, flat[name], "black or constant")
+    file.report("noisy, noisy_input", flat["noisy"] & flat["noisy_input"], "both black or constant")
     depth = file.arrays["depth"]
-    file.say("depth", (depth == 0).reshape(len(depth), -1).all(1), "the camera sees no surface")
+    file.report("depth", (depth == 0).reshape(len(depth), -1).all(1), "the camera sees no surface")
 
 
 def _check_splits(spec: DatasetSpec, states: Mapping[tuple[int, str], set[bytes]]) -> Iterable[str]:
     for scene, description in enumerate(spec.descriptions):
         if not description.movables(spec.experiment):
-            continue  # nothing moves: there is one state
-        for one, other in combinations(SPLITS, 2):
-            if shared := states.get((scene, one), set()) & states.get((scene, other), set()):
-                yield f"{description.name}: {len(shared)} states are in {one} and in {other}"
+            continue  # without movable objects there is only one state
+        for first, second in combinations(SPLITS, 2):
+            if shared := states.get((scene, first), set()) & states.get((scene, second), set()):
+                yield f"{description.name}: {len(shared)} states are in {first} and in {second}"

@@ -1,1 +1,1 @@
-"""Comparison, timing, tables and figures."""
+"""Comparison of methods: training, evaluation, timing, and results on disk."""

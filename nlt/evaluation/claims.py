@@ -1,4 +1,4 @@
-"""The paper's claims (claims.yaml), judged on stored results: holds, does not hold, or undecided at this scale."""
+"""The paper's claims (claims.yaml), judged on stored results: each holds, does not hold or is undecided."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ BELOW_FLOOR = "the difference is smaller than the reference's own error"
 
 @dataclass(frozen=True)
 class Inequality:
-    """One inequality of a claim: `margin` is positive where it is as claimed, in the metric's unit.
+    """One comparison of a claim; `margin` is in the metric's unit, and positive if it supports the claim.
 
-    `low` and `high`: 95% interval of the margin over test images and, where there are several, over seeds.
+    `low` and `high` bound the margin's 95% interval over test images and, with several seeds, over seeds.
     `below_floor`: the two methods differ by less than the two halves of the reference do.
     """
 
@@ -44,7 +44,7 @@ class Inequality:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper and what the results say of it."""
+    """A claim of the paper and its verdict on the results."""
 
     id: str
     where: str
@@ -54,23 +54,23 @@ class Claim:
 
     @property
     def weakest(self) -> Inequality:
-        """The comparison that decides the verdict: the one of its kind that is furthest from what is claimed."""
+        """The comparison that decides the verdict: the least margin, relative to its interval, with this verdict."""
         deciding = [c for c in self.comparisons if c.verdict == self.verdict]
         scale = lambda c: abs(c.high - c.low) or 1.0
         return min(deciding, key=lambda c: c.margin / scale(c) if math.isfinite(c.margin) else -math.inf)
 
 
 def claims_of(table: str | None) -> list[dict[str, Any]]:
-    """The claims that a table of the paper makes, as they stand in claims.yaml."""
+    """Return the claims of one of the paper's tables, as written in claims.yaml."""
     content = yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text())
     return [claim for claim in content["claims"] if claim["table"] == table]
 
 
 def judge(results: Results) -> list[Claim]:
-    """Every claim of the results' table.
+    """Judge every claim of the results' table.
 
-    A claim holds if all its comparisons do, and does not if one does not; a comparison is decided when its interval
-    does not contain the margin's other sign.
+    A claim holds if all of its comparisons hold, and does not hold if any of them does not. A comparison is undecided
+    if the 95% interval of its margin contains 0.
     """
     return [_judge(results, claim) for claim in claims_of(results.manifest["table"])]
 
@@ -80,14 +80,14 @@ def _judge(results: Results, claim: dict[str, Any]) -> Claim:
         pairs = list(pairwise(claim["order"]))
     else:
         pairs = list(product(claim.get("better") or claim["close"], claim.get("than") or claim["to"]))
-    found = [
+    comparisons = [
         _compare(results, metric, method, other, claim.get("by", 0.0), claim.get("within"))
         for metric, (method, other) in product(claim["metrics"], pairs)
     ]
-    verdicts = {comparison.verdict for comparison in found}
-    order: tuple[Verdict, ...] = ("does not hold", "not measured", "undecided", "holds")
-    verdict = next(v for v in order if v in verdicts)
-    return Claim(claim["id"], claim["where"], claim["says"], verdict, found)
+    verdicts = {comparison.verdict for comparison in comparisons}
+    priority: tuple[Verdict, ...] = ("does not hold", "not measured", "undecided", "holds")
+    verdict = next(v for v in priority if v in verdicts)
+    return Claim(claim["id"], claim["where"], claim["says"], verdict, comparisons)
 
 
 def _compare(results: Results, metric: str, method: str, other: str, by: float, within: float | None) -> Inequality:
@@ -99,7 +99,7 @@ def _compare(results: Results, metric: str, method: str, other: str, by: float, 
         gap, error = difference(results, metric, method, other)
         allowed = within * abs(results.mean(other, metric))
         margin = allowed - abs(gap)
-        # The interval of |gap|, mirrored: its lower end is 0 where the interval of the gap contains 0.
+        # If the interval of the gap contains 0, |gap| reaches down to 0.
         low, high = allowed - abs(gap) - error, allowed - max(abs(gap) - error, 0)
     if not math.isfinite(margin):
         verdict: Verdict = "not measured"
@@ -110,11 +110,12 @@ def _compare(results: Results, metric: str, method: str, other: str, by: float, 
 
 
 def difference(results: Results, metric: str, a: str, b: str, factor: float = 1.0) -> tuple[float, float]:
-    """factor * A - B, means over seeds, and half its 95% interval; NaN where not measured or below two images.
+    """Return factor * A - B, of means over seeds, and half the width of its 95% interval.
 
-    Variances add: that over test images (of the pairs' differences; for FID and KID by the jackknife; for the time
-    per frame over its frames), and those of the seeds of A and of B. Student's t, its degrees of freedom by Welch
-    and Satterthwaite.
+    Both are NaN if a value was not measured; the interval is NaN with fewer than two test images. Its variance is the
+    sum of those over test images (of paired differences; for FID and KID by the jackknife; for the time per frame
+    over the timed frames) and over the seeds of A and of B. The interval uses Student's t with degrees of freedom by
+    Welch and Satterthwaite.
     """
     value = factor * results.mean(a, metric) - results.mean(b, metric)
     parts = [_image_variance(results, metric, a, b, factor)]
@@ -132,7 +133,7 @@ def difference(results: Results, metric: str, a: str, b: str, factor: float = 1.
 
 
 def _image_variance(results: Results, metric: str, a: str, b: str, factor: float) -> tuple[float, int]:
-    """Of factor * A - B, over test images, or frames; and its degrees of freedom."""
+    """Return the variance of factor * A - B over test images or timed frames, and its degrees of freedom."""
     if metric == "time_per_frame_s":
         errors = [weight * results.mean(m, "time_per_frame_error_s") for m, weight in ((a, factor), (b, 1.0))]
         return sum(e**2 for e in errors), results.manifest["clock"]["timed_frames"] - 1
@@ -140,15 +141,15 @@ def _image_variance(results: Results, metric: str, a: str, b: str, factor: float
     x, y = (results.per_view(method, metric if per_image else f"{metric}_without") for method in (a, b))
     if len(x) < 2 or len(x) != len(y):
         return math.nan, 1
-    d = factor * x - y
+    differences = factor * x - y
     if per_image:
-        return float(d.var(ddof=1)) / len(d), len(d) - 1
-    d = d[:GROUPS]  # a value per group: view k is in group k modulo their number
-    return standard_error(d) ** 2, len(d) - 1
+        return float(differences.var(ddof=1)) / len(differences), len(differences) - 1
+    differences = differences[:GROUPS]  # one value per jackknife group: view k is in group k % GROUPS
+    return standard_error(differences) ** 2, len(differences) - 1
 
 
 def text(claim: Claim) -> str:
-    """The comparison that decides a claim, in words and numbers."""
+    """Return the comparison that decides a claim, in words and numbers."""
     c = claim.weakest
     name = f"{QUANTITIES[c.metric].label}, {label(c.method)} against {label(c.other)}"
     if not math.isfinite(c.margin):
@@ -158,19 +159,19 @@ def text(claim: Claim) -> str:
 
 
 def write_claims(results: Results) -> list[Claim]:
-    """claims.json with every comparison, claims.md with the one that decides each claim."""
+    """Write claims.json with every comparison and claims.md with the deciding ones; return the claims."""
     claims = judge(results)
     if not claims:
         return claims
     content = [dataclasses.asdict(claim) for claim in claims]
     write_bytes(results.directory / "claims.json", (json.dumps(_without_nan(content), indent=1) + "\n").encode())
     seeds = len(results.manifest["seeds"])
-    over = f"test images and {seeds} seeds" if seeds > 1 else "test images; with one seed, that of seeds is not in it"
+    over = f"test images and {seeds} seeds" if seeds > 1 else "test images, not over seeds, because there is only one"
     lines = [
         "# Claims of the paper", "",
-        f"The margin is positive where the comparison is as claimed; in brackets its 95% interval over {over}. "
-        "Shown is the comparison that decides; all are in claims.json.", "",
-        "| claim | verdict | what decides | the paper says | where |", "|---|---|---|---|---|",
+        f"A positive margin supports the claim; in brackets is its 95% interval over {over}. "
+        "Each row shows the comparison that decides the verdict; claims.json has all comparisons.", "",
+        "| claim | verdict | deciding comparison | the paper says | where |", "|---|---|---|---|---|",
         *(f"| {c.id} | **{c.verdict}** | {text(c)} | {c.says} | {c.where} |" for c in claims), "",
     ]  # fmt: skip
     write_bytes(results.directory / "claims.md", "\n".join(lines).encode())
@@ -178,9 +179,9 @@ def write_claims(results: Results) -> list[Claim]:
 
 
 def _without_nan(value: Any) -> Any:
-    """JSON has no NaN."""
+    """Return a copy with None for NaN, which JSON does not have."""
     if isinstance(value, dict):
-        return {key: _without_nan(each) for key, each in value.items()}
+        return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_without_nan(each) for each in value]
+        return [_without_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""What a frame costs: time, stage by stage, at batch 1; floating-point operations; memory."""
+"""The cost of a frame: time per stage at batch 1, floating-point operations, memory."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy
 
 WARM_UP, FRAMES, LEAST_FRAMES = 10, 40, 3
-_WARM_UP_SHARE = 0.2  # of a limited time
+_WARM_UP_SHARE = 0.2  # of the time limit
 
 
 class Clock:
-    """Measures methods on the same frames: a dataset's samples, each with its own state and view.
+    """Measures the cost of methods on the same frames: a dataset's samples, each with its own state and view.
 
-    What is charged is what a renderer would pay for a new frame: G-buffer, photon casting, path tracing of the
-    pixels that the method is fed with, light transport, projection and synthesis or denoising. Not charged,
-    being the same for all methods: moving the scene's objects.
+    A frame's cost includes all that a renderer does for a new frame: G-buffer, photon casting, path tracing of the
+    method's input pixels, light transport, projection, and synthesis or denoising. Moving the scene's objects is left
+    out, because it costs the same for all methods.
 
-    `batch`: how many frames are made at once. `policy`: how they are computed; None for the device's own.
+    `batch` is the number of frames computed at once; `policy` is None for the device's default.
     """
 
     def __init__(self, frames: Frames, device: torch.device, batch: int = 1, policy: Policy | None = None) -> None:
@@ -44,32 +44,34 @@ class Clock:
         self.policy = policy or Policy.for_device(device)
 
     def time(self, method: Method) -> dict[str, Any]:
-        """Seconds by stage and of the frame, as `summary` says; warm-up 10 frames, then 40 timed ones."""
+        """Return the seconds per stage and per frame (see `summary`) over 40 frames, after 10 warm-up frames."""
         return summary(self.time_interleaved({"": method})[""])
 
     def time_interleaved(
         self, methods: Mapping[str, Method], seconds: float = math.inf
     ) -> dict[str, list[dict[str, float]]]:
-        """Seconds by stage of every timed frame, by method; the device is synchronised around every stage.
+        """Return the seconds per stage of every timed frame, by method, from interleaved timing.
 
-        The methods take turns at each frame, so that whatever else the machine does slows all. Warm-up 10 frames, then
-        40 timed ones; when `seconds` are over, fewer, but 2 and 3 at least.
+        The methods take turns on each frame, so that other load on the machine slows all of them alike. The device is
+        synchronised around every stage. There are 10 warm-up and 40 timed frames, fewer if `seconds` run out, but at
+        least 2 and 3.
         """
         methods = {name: method.to(self.device).eval() for name, method in methods.items()}
         rows = np.linspace(0, len(self.dataset) - 1, min(len(self.dataset), WARM_UP + FRAMES)).astype(int)
-        far = math.ceil(len(rows) / len(self.dataset.spec.scenes))  # so that the warm-up compiles every scene's kernels
-        rows = np.concatenate([rows[first::far] for first in range(far)])
+        # The scenes are interleaved, so that the warm-up compiles the kernels of each.
+        stride = math.ceil(len(rows) / len(self.dataset.spec.scenes))
+        rows = np.concatenate([rows[first::stride] for first in range(stride)])
         timed: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
-        begin, number = time.perf_counter(), 0
+        start, row_number = time.perf_counter(), 0
         with torch.inference_mode(), self.policy.applied(self.device):
-            for most, least, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
+            for maximum, minimum, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
                 for laps in timed.values():
                     laps.clear()
-                for k in range(most):
-                    if k >= least and time.perf_counter() - begin > share * seconds:
+                for k in range(maximum):
+                    if k >= minimum and time.perf_counter() - start > share * seconds:
                         break
-                    indices = [int(rows[(number + j) % len(rows)]) for j in range(self.batch)]
-                    number += self.batch
+                    indices = [int(rows[(row_number + j) % len(rows)]) for j in range(self.batch)]
+                    row_number += self.batch
                     for name, method in methods.items():
                         timed[name].append(self._frame(method, indices))
         return timed
@@ -82,25 +84,25 @@ class Clock:
         for row, index in enumerate(indices):
             renderer, camera = self.frames.place(index)
             if "gbuffer" in method.stages:
-                self._lap(seconds, "gbuffer", partial(renderer.gbuffer, camera))
+                self._timed(seconds, "gbuffer", partial(renderer.gbuffer, camera))
             if "photons" in method.stages:
-                self._lap(seconds, "photons", partial(renderer.photons, method.num_photons or spec.photons, index))
+                self._timed(seconds, "photons", partial(renderer.photons, method.num_photons or spec.photons, index))
             if "path_tracing" in method.stages:
                 pixels = None if method.pixel_fraction == 1 else mask[row, 0].flatten().nonzero()[:, 0].cpu().numpy()
                 spp = method.spp or spec.input_spp
                 work = partial(renderer.radiance, camera, spp, index, pixels)
-                traced.append(self._lap(seconds, "path_tracing", work))
+                traced.append(self._timed(seconds, "path_tracing", work))
         if "traced" in method.fields:
             batch["traced"] = torch.from_numpy(np.stack(traced)).to(self.device)
         result: Any = None
         for name, step in method.steps().items():
-            result = self._lap(seconds, name, partial(step, batch, result))
+            result = self._timed(seconds, name, partial(step, batch, result))
         return seconds
 
     def _batch(self, indices: Sequence[int]) -> Batch:
         return {k: v.to(self.device) for k, v in default_collate([self.dataset[index] for index in indices]).items()}
 
-    def _lap(self, seconds: dict[str, float], stage: str, work: Callable[[], Any]) -> Any:
+    def _timed(self, seconds: dict[str, float], stage: str, work: Callable[[], Any]) -> Any:
         self._synchronize()
         start = time.perf_counter()
         result = work()
@@ -113,11 +115,11 @@ class Clock:
             torch.cuda.synchronize(self.device)
 
     def size(self, method: Method) -> dict[str, Any]:
-        """Parameters; FLOPs of a batch's convolutions and matrix products; peak memory of its computation.
+        """Return the number of parameters, a batch's FLOPs, and the peak memory of its computation in bytes.
 
-        The renderer's share is not in it, so a method that computes nothing by PyTorch has neither of the latter.
-        The memory is that of parameters, inputs and, of what is computed, the most that is alive at once; on
-        CUDA by the allocator, elsewhere by the tensors, without what an operator needs only within itself.
+        FLOPs are those of convolutions and matrix products. Rendering is not counted, so a method that computes
+        nothing in PyTorch has no FLOPs and no memory. Peak memory includes parameters, inputs and the largest amount
+        of results alive at once: on CUDA as the allocator counts it, elsewhere without operators' internal buffers.
         """
         parameters = list(method.parameters())
         sizes: dict[str, Any] = {"parameters": sum(p.numel() for p in parameters)}
@@ -133,49 +135,49 @@ class Clock:
         with torch.no_grad(), self.policy.applied(self.device), memory:
             method(batch)
         peak = torch.cuda.max_memory_allocated(self.device) - before if cuda else memory.peak
-        held = sum(t.numel() * t.element_size() for t in [*parameters, *batch.values()])
-        return sizes | {"flops": sum(self.flops(method).values()), "peak_memory_bytes": held + peak}
+        held_bytes = sum(t.numel() * t.element_size() for t in [*parameters, *batch.values()])
+        return sizes | {"flops": sum(self.flops(method).values()), "peak_memory_bytes": held_bytes + peak}
 
     @torch.no_grad()
     def flops(self, method: RenderingModule) -> dict[str, int]:
-        """Floating-point operations of a batch's convolutions and matrix products, by step: without any shortcut."""
+        """Return the FLOPs of a batch's convolutions and matrix products by step, without sparse or int8 shortcuts."""
         batch, result, flops = self._inputs(method), None, {}
-        straight = replace(self.policy, sparse=False, int8=False)
+        dense_policy = replace(self.policy, sparse=False, int8=False)
         for name, step in method.to(self.device).eval().steps().items():
-            with straight.applied(self.device), FlopCounterMode(display=False) as counter:
+            with dense_policy.applied(self.device), FlopCounterMode(display=False) as counter:
                 result = step(batch, result)
             flops[name] = counter.get_total_flops()
         return flops
 
     def _inputs(self, method: Method) -> Batch:
-        """A batch with what the method reads and no more."""
-        whole = self._batch([k % len(self.dataset) for k in range(self.batch)])
-        batch = {name: value for name, value in whole.items() if name in (*method.fields, "exposure", "scene")}
+        """Return a batch of only the fields that the method reads."""
+        full_batch = self._batch([k % len(self.dataset) for k in range(self.batch)])
+        batch = {name: value for name, value in full_batch.items() if name in (*method.fields, "exposure", "scene")}
         return method.subsample(batch | {"index": torch.zeros_like(batch["scene"])})
 
 
 def summary(laps: list[dict[str, float]]) -> dict[str, Any]:
-    """Of timed frames, in seconds: median and p95 by stage; `time_per_frame_s` is the sum of the stages' medians.
+    """Return the median and 95th percentile of timed frames by stage, in seconds.
 
-    `moving_camera_s` leaves out what does not depend on the camera. `time_per_frame_error_s` is the standard error of
-    `time_per_frame_s`, bootstrapped over the frames.
+    `time_per_frame_s` is the sum of the stages' medians, and `time_per_frame_error_s` its standard error, bootstrapped
+    over the frames. `moving_camera_s` leaves out the stages that do not depend on the camera.
     """
     stages = {name: np.array([frame[name] for frame in laps]) for name in laps[0]}
     result = {f"{name}_s": float(np.median(seconds)) for name, seconds in stages.items()}
     moving = sum(value for name, value in result.items() if name.removesuffix("_s") not in STATE_STAGES)
     result |= {"time_per_frame_s": sum(result.values()), "moving_camera_s": moving}
     total = lambda *seconds, axis: sum(np.median(s, axis=axis) for s in seconds)
-    spread = scipy.stats.bootstrap(
+    bootstrap = scipy.stats.bootstrap(
         tuple(stages.values()), total, paired=True, n_resamples=200, method="basic", rng=np.random.default_rng(0)
     )
-    result["time_per_frame_error_s"] = float(spread.standard_error)
+    result["time_per_frame_error_s"] = float(bootstrap.standard_error)
     result |= {f"{name}_p95_s": float(np.percentile(seconds, 95)) for name, seconds in stages.items()}
     result["time_per_frame_p95_s"] = float(np.percentile(sum(stages.values()), 95))
     return result
 
 
 class _AliveMemory(TorchDispatchMode):
-    """The most bytes of tensors that are alive at once, of those that are made within."""
+    """Tracks the peak memory, in bytes, of the tensors created within the context that are alive at once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -199,6 +201,6 @@ class _AliveMemory(TorchDispatchMode):
 
 
 def _storages(tree: Any) -> list[Any]:
-    """Of the tensors in it; weights that oneDNN has packed show none."""
+    """Return the storages of the tensors in a tree, except weights packed by oneDNN, which expose none."""
     leaves = (leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor) and leaf.layout == torch.strided)
     return [leaf.untyped_storage() for leaf in leaves]

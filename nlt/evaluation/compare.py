@@ -1,4 +1,4 @@
-"""`nlt compare`: generate, train, evaluate and time all methods, and write the results that tables are made from."""
+"""`nlt compare`: generate data, train, evaluate and time all methods, and write the results behind the tables."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
 
-JUDGED = "judged.npz"  # in a run's directory
-_ROW = ("method", "seed", "train_images", "status", "message")  # of training_images.csv, before its metrics
+JUDGED = "judged.npz"  # the cached evaluation in a run's directory
+_ROW = ("method", "seed", "train_images", "status", "message")  # columns of training_images.csv before its metrics
 
 
 def compare(
@@ -53,22 +53,25 @@ def compare(
     train_images: Sequence[int] = (),
     after_row: Callable[[Path], None] = lambda directory: None,
 ) -> Path:
-    """Everything that a table needs, of which what is there already is kept. Returns its directory.
+    """Run a comparison, reusing what is already finished, and return the directory of its results.
 
     Args:
-        workers: trainings side by side (default: on this machine in turn).
-        scheduler, slurm: as `nlt.data.engines.find_engine`, for generation and trainings; the rest is done here.
-        train_images: train every method on the first so many images of each scene, too.
-        after_row: called with the directory each time a row has been written.
+        workers: number of trainings that run in parallel (default: one on this machine).
+        scheduler, slurm: as for `nlt.data.engines.find_engine`, for generation and training; the rest runs here.
+        train_images: also train every method on only the first N images of each scene, for each N given.
+        after_row: called with the directory after each row is written.
+
+    Raises:
+        UserError: a config, an option or the dataset is wrong, or the disk is full.
     """
-    start, begun = time.time(), origin()
+    start, provenance = time.time(), origin()
     directory = Path(out or Path("results") / comparison.name)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
-        raise UserError(f"{comparison.scale}: data.dataset.test: is 0; a comparison needs test samples")
+        raise UserError(f"{comparison.scale}: data.dataset.test: must be at least 1 for a comparison, is 0")
     for count in train_images:
         if count > spec.train:
-            raise UserError(f"--train-images: {count} is more than data.dataset.train, {spec.train}")
+            raise UserError(f"--train-images: {count} is more than data.dataset.train; give at most {spec.train}")
     jobs = comparison.jobs()
     check(comparison)
     dataset = generate(spec, root, workers, scheduler, slurm)
@@ -78,7 +81,7 @@ def compare(
         for job in jobs
         if not build_if_untrained(job[0])
     }
-    died = train(list(trainings.values()), scheduler, workers, slurm or {})
+    failures = train(list(trainings.values()), scheduler, workers, slurm or {})
     if history := _history(trainings.values()):
         write_rows(directory / HISTORY, history)
     device = default_device()
@@ -87,11 +90,11 @@ def compare(
     test, clock = Evaluation(frames, device, policy), Clock(frames, device, policy=policy)
     test.write_references(directory)
     record = {
-        **begun,
+        **provenance,
         **surroundings(device, policy),
-        **_subject(comparison, test),
+        **_describe_comparison(comparison, test),
         "train_images": sorted(train_images),
-        **_floor(test),
+        **_describe_references(test),
     }
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
@@ -99,16 +102,16 @@ def compare(
         print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed}
         with _record_failure(run):
-            module, took, place = build_if_untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
+            module, facts, folder = build_if_untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
             if module is None:
                 training = trainings[method, seed, None]
-                (module, took), place = _trained(training, died, device), training.run
-            of = _evaluation_cache_key(record, method, took)
-            metrics, each, radiance = test.evaluate_once(module, place / JUDGED, of)
-            run |= clock.time(module) | metrics | clock.size(module) | took
+                (module, facts), folder = _load_trained(training, failures, device), training.run
+            key = _evaluation_cache_key(record, method, facts)
+            metrics, view_rows, radiance = test.evaluate_once(module, folder / JUDGED, key)
+            run |= clock.time(module) | metrics | clock.size(module) | facts
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
             run["spp"] = (module.spp or spec.input_spp) if "path_tracing" in module.stages else 0
-            views += [{"method": method, "seed": seed, **row} for row in each]
+            views += [{"method": method, "seed": seed, **row} for row in view_rows]
             if seed == comparison.seeds[0]:
                 write_images(directory, method, radiance=radiance)
         runs.append(run)
@@ -121,19 +124,21 @@ def compare(
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         after_row(directory)
     print("\n" + "\n".join([live.header(), *(live.row(run) for run in runs), live.floor(record["floor"])]))
-    # What the table's own trainings saw is a point of the curve, too.
-    images = [
+    # The curve also has the trainings on all images.
+    full_trainings = [
         {**run, "train_images": spec.train} for run in runs if train_images and not build_if_untrained(run["method"])
     ]
-    rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in images]
-    rows += [_on_fewer(training, died, test, record) for training in trainings.values() if training.train_images]
+    rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in full_trainings]
+    rows += [
+        _fewer_images_row(training, failures, test, record) for training in trainings.values() if training.train_images
+    ]
     if rows:
         write_rows(directory / TRAINING_IMAGES, rows)
     return directory
 
 
-def _subject(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
-    """What is compared, and on what, for the manifest."""
+def _describe_comparison(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
+    """Return the manifest's entries on what is compared and on which data."""
     return {
         "comparison": comparison.name,
         "table": comparison.table,
@@ -149,38 +154,38 @@ def _subject(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
     }
 
 
-def _floor(test: Evaluation) -> dict[str, Any]:
-    """How good the references are, for the manifest."""
+def _describe_references(test: Evaluation) -> dict[str, Any]:
+    """Return the manifest's entries on the accuracy of the references."""
     floor, measured = test.floor()
-    known = zip(measured.items(), references(test.directory, test.spec), strict=True)
-    return {"floor": floor, "references": {scene: {**found, "measured_mse": mse} for (scene, mse), found in known}}
+    scenes = zip(measured.items(), references(test.directory, test.spec), strict=True)
+    return {"floor": floor, "references": {scene: {**entry, "measured_mse": mse} for (scene, mse), entry in scenes}}
 
 
-def _on_fewer(
-    training: Training, died: Mapping[Training, str], test: Evaluation, record: Mapping[str, Any]
+def _fewer_images_row(
+    training: Training, failures: Mapping[Training, str], test: Evaluation, record: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """A row of training_images.csv, of a training on some of the images."""
+    """Evaluate a training on fewer images and return its row of training_images.csv."""
     row: dict[str, Any] = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
     with _record_failure(row):
-        module, took = _trained(training, died, test.device)
-        row |= test.evaluate_once(module, training.run / JUDGED, _evaluation_cache_key(record, training.method, took))[
+        module, facts = _load_trained(training, failures, test.device)
+        row |= test.evaluate_once(module, training.run / JUDGED, _evaluation_cache_key(record, training.method, facts))[
             0
         ]
     print(f"{training.name}: {row['status']} {row['message']}", flush=True)
     return row
 
 
-def _evaluation_cache_key(record: Mapping[str, Any], method: str, took: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What decides how a method is judged; None by code that has no name."""
+def _evaluation_cache_key(record: Mapping[str, Any], method: str, facts: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the cache key of a method's evaluation; None if the code is not exactly a commit."""
     if not record["commit"] or record["uncommitted_changes"]:
         return None
     names = ("commit", "versions", "device", "policy", "inception_weights")
-    return {**{name: record[name] for name in names}, "config": record["configs"][method], **took}
+    return {**{name: record[name] for name in names}, "config": record["configs"][method], **facts}
 
 
 @contextmanager
 def _record_failure(row: dict[str, Any]) -> Iterator[None]:
-    """Whatever goes wrong is noted in the row, and the others go on; but for a user's mistake, a full disk."""
+    """Record an error in the row, so that the other rows go on; user errors and a full disk are raised."""
     row |= {"status": OK, "message": ""}
     try:
         yield
@@ -192,16 +197,16 @@ def _record_failure(row: dict[str, Any]) -> Iterator[None]:
         row |= {"status": FAILED, "message": " ".join(f"{type(error).__name__}: {error}".split())}
 
 
-def _trained(
-    training: Training, died: Mapping[Training, str], device: torch.device
+def _load_trained(
+    training: Training, failures: Mapping[Training, str], device: torch.device
 ) -> tuple[RenderingModule, dict[str, Any]]:
-    if training in died:
-        raise Died(died[training])
+    if training in failures:
+        raise Died(failures[training])
     return training.load(device)
 
 
 def _history(trainings: Iterable[Training]) -> list[dict[str, Any]]:
-    """The rows of history.csv."""
+    """Return the rows of history.csv."""
     return [
         {"method": training.method, "seed": training.seed, **row}
         for training in trainings

@@ -1,4 +1,4 @@
-"""What a config of configs/compare asks for."""
+"""A comparison as a config of configs/compare describes it: methods, seeds, data, scale."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _KEYS = ("table", "data", "scale", "variant", "methods", "seed")
 
 @dataclass
 class Comparison:
-    """What a config of configs/compare asks for.
+    """A comparison as a config of configs/compare describes it.
 
-    `variant` is a config of configs/variant that changes every trained method; METHOD@VARIANT changes one of them,
-    after that. The name says whether the scale or the data are other than the config's.
+    `variant` is a config of configs/variant that changes every trained method; METHOD@VARIANT applies a further one to
+    a single method. `name` includes the scale or the data if they differ from the config's.
     """
 
     name: str
@@ -62,51 +62,55 @@ class Comparison:
         if table is not None and table not in tables():
             raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise UserError(f"{file}: seed: must be a whole number of at least 0, is {seed!r}")
+            raise UserError(f"{file}: seed: must be an integer of at least 0, is {seed!r}")
         variants = config_names("variant")
-        every = content.get("variant")
-        if every is not None and every not in variants:
-            raise UserError(f"{file}: variant: none is named {every!r}; known are {', '.join(variants)}")
+        shared = content.get("variant")
+        if shared is not None and shared not in variants:
+            raise UserError(f"{file}: variant: no variant {shared!r} in configs/variant; known: {', '.join(variants)}")
         known = sorted(config_names("model"), key=order)
-        # Those in folders belong to a comparison that names them.
-        wanted = methods or content.get("methods") or [name for name in known if "/" not in name]
-        for method in wanted:
+        # Methods in subfolders take part only where a comparison names them.
+        chosen = methods or content.get("methods") or [name for name in known if "/" not in name]
+        for method in chosen:
             name, _, variant = method.partition("@")
             if name not in known:
-                raise UserError(f"{file}: methods: no method {name!r} in configs/model; known are {', '.join(known)}")
+                raise UserError(f"{file}: methods: no method {name!r} in configs/model; known: {', '.join(known)}")
             if "@" in method and variant not in variants:
                 raise UserError(
-                    f"{file}: methods: no variant {variant!r} in configs/variant; known are {', '.join(variants)}"
+                    f"{file}: methods: no variant {variant!r} in configs/variant; known: {', '.join(variants)}"
                 )
         return cls(
             name="-".join(names),
             data=find_config("data", content["data"]),
             scale=find_config("scale", content["scale"]),
-            variant=find_config("variant", every) if every else None,
+            variant=find_config("variant", shared) if shared else None,
             table=table,
-            methods=sorted(wanted, key=order),
+            methods=sorted(chosen, key=order),
             seeds=list(range(seed, seed + seeds)),
             precision=precision,
         )
 
     def jobs(self) -> list[tuple[str, int]]:
-        """The rows to make: a method and a seed each; what is not trained has one seed."""
+        """Return the rows of the comparison as (method, seed); methods without training have one seed."""
         return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if build_if_untrained(m) else self.seeds)]
 
     def configs(self, method: str) -> list[str]:
-        """The config files of a method's training, in order."""
+        """Return the config files of a method's training, later ones overriding earlier ones."""
         name, _, variant = method.partition("@")
         variants = [self.variant, find_config("variant", variant) if variant else None]
         return [str(path) for path in (self.data, find_config("model", name), self.scale, *filter(None, variants))]
 
 
 def build_if_untrained(method: str) -> Method | None:
-    """The method, if its class is one that needs no training; None for one that does."""
+    """Return the method if its class needs no training, else None.
+
+    Raises:
+        UserError: its init_args do not fit the class.
+    """
     file = find_config("model", method.partition("@")[0])
     model = read_configs([str(file)]).get("model", {})
     kind = pydoc.locate(str(model.get("class_path")))
     if not (isinstance(kind, type) and issubclass(kind, Method)) or issubclass(kind, RenderingModule):
-        return None  # what it is that is no class at all, training will say
+        return None  # a class path that names no class is reported by the training
     try:
         return kind(**model.get("init_args", {}))
     except TypeError as error:

@@ -1,4 +1,4 @@
-"""`nlt export`: a trained method's frame as one file that needs nothing but PyTorch, or its weights as safetensors."""
+"""`nlt export`: a trained method as a program that needs only PyTorch, or its weights as safetensors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAFETENSORS = ".safetensors"
 
 
 class _Frame(nn.Module):
-    """What is exported: not the method itself, whose hooks are the trainer's."""
+    """The exported module: a method without its trainer hooks."""
 
     def __init__(self, method: RenderingModule) -> None:
         super().__init__()
@@ -37,13 +37,14 @@ class _Frame(nn.Module):
 
 
 def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
-    """Write a method's network as a torch.export program: from a dict of batch fields, batch 1, to radiance.
+    """Write a method's network as a torch.export program that maps a dict of batch fields, batch 1, to radiance.
 
-    In float32, at this resolution and for this many photons; the file's inputs.json says which fields it reads.
-    If `output` ends in .safetensors, the weights instead, with all that `load_trained` needs to build the method.
+    The program runs in float32 at this resolution and with this many photons; the file's inputs.json describes the
+    fields that it reads. If `output` ends in .safetensors, write the weights instead, with all that `load_trained`
+    needs to rebuild the method.
 
     Raises:
-        UserError: not a checkpoint, or, for safetensors, not in the directory of its run.
+        UserError: `checkpoint` is not a checkpoint or, for safetensors, not in its run's directory.
     """
     if output.endswith(SAFETENSORS):
         save_trained(*load_trained(checkpoint), output)
@@ -65,45 +66,50 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
 
 
 def save_trained(method: RenderingModule, spec: DatasetSpec, points: list[int], output: str) -> None:
-    """Write a method and what it was trained on as safetensors, as `load_trained` returns it."""
+    """Write a method, its dataset's spec and its points' checksums as safetensors for `load_trained`."""
     settings = {key: value for key, value in method.hparams.items() if not key.startswith("_")}
-    about = {
+    metadata = {
         "method": method.class_path(),
         "init_args": settings,
         "dataset": dataclasses.asdict(spec),
         "points": points,
     }
     weights = {name: tensor.contiguous() for name, tensor in method.state_dict().items()}
-    write_bytes(Path(output), save(weights, {"nlt": json.dumps(about)}))
+    write_bytes(Path(output), save(weights, {"nlt": json.dumps(metadata)}))
 
 
 def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
-    """A trained method, of a checkpoint within its run or of safetensors, and the dataset that it was trained on.
+    """Load a trained method from a checkpoint in its run's directory or from safetensors.
 
-    Last the `points_crc` of each of its scenes; none of a file from before they were kept.
+    Returns the method, the spec of the dataset that it was trained on, and the `points_crc` of each scene, which is
+    empty for files from before checksums were stored.
 
     Raises:
-        UserError: it cannot be read, or is none.
+        UserError: the file cannot be read or holds no trained method.
     """
     if not path.endswith(SAFETENSORS):
         method, config = load_method(path, "CKPT"), Path(path).absolute().parents[1] / "config.yaml"
         if not config.exists():
-            raise UserError(f"CKPT: {path}: {config} is missing, which says of what data; leave it in its run")
+            raise UserError(
+                f"CKPT: {path}: {config} is missing; keep the checkpoint in its run, whose config names the dataset"
+            )
         try:
             spec = DatasetSpec(**read_configs([str(config)])["data"]["dataset"])
         except (LookupError, TypeError):
-            raise UserError(f"CKPT: {path}: {config} says of no data; leave the checkpoint in its run") from None
+            raise UserError(f"CKPT: {path}: {config} names no dataset; keep the checkpoint in its run") from None
         return method, spec, read_checkpoint(path).get(LightTransportDataModule.__qualname__, {}).get("points", [])
     try:
         with safe_open(path, "pt") as file:
-            about = json.loads(file.metadata()["nlt"])
+            metadata = json.loads(file.metadata()["nlt"])
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        kind = pydoc.locate(about["method"])
+        kind = pydoc.locate(metadata["method"])
         assert isinstance(kind, type) and issubclass(kind, RenderingModule)
-        method = kind(**about["init_args"])
+        method = kind(**metadata["init_args"])
         method.load_state_dict(weights)
-        return method, DatasetSpec(**about["dataset"]), about.get("points", [])
+        return method, DatasetSpec(**metadata["dataset"]), metadata.get("points", [])
     except OSError as error:
         raise UserError(f"CKPT: {path}: cannot be read: {error.strerror or error}") from None
     except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, AssertionError):
-        raise UserError(f"CKPT: {path}: not a model of nlt export -o NAME{SAFETENSORS}, or damaged") from None
+        raise UserError(
+            f"CKPT: {path}: damaged, or not written by nlt export -o NAME{SAFETENSORS}; export it again"
+        ) from None

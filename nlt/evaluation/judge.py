@@ -1,4 +1,4 @@
-"""A method's images of the test split, judged by one set of metrics."""
+"""Evaluation of a method's images of the test split by one set of metrics."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from nlt.models.module import PROJECTION
 from nlt.models.policy import Policy
 from nlt.models.projection import visible_pixels
 
-_SHOWN = 32  # test views whose images are kept
+_SHOWN = 32  # test views whose images are stored
 _BATCH = 16
-_MAX_CACHED = 512  # test images whose reference features (4 MB each) are kept: in memory, and for later runs on disk
+_MAX_CACHED = 512  # test images at most whose reference features (4 MB each) are cached in memory and on disk
 
 
 class Evaluation:
-    """The test split, judged by one set of metrics; reference features are computed once for all methods."""
+    """Evaluates methods on the test split; reference features are computed once for all methods."""
 
     def __init__(self, frames: Frames, device: torch.device, policy: Policy) -> None:
         self.frames, self.device, self.policy = frames, device, policy
@@ -45,7 +45,7 @@ class Evaluation:
         return self.spec.test * len(self.spec.scenes)
 
     def write_references(self, directory: Path) -> None:
-        """images/reference.npz, noisy.npz and gbuffer.npz of the shown views."""
+        """Write images/reference.npz, noisy.npz and gbuffer.npz of the shown views."""
         samples = [self.frames.dataset[k] for k in self.shown]
         stack = {name: np.stack([sample[name].numpy() for sample in samples]) for name in samples[0]}
         reference = (stack["reference_a"] + stack["reference_b"]) / 2
@@ -53,14 +53,14 @@ class Evaluation:
         write_images(directory, "reference", radiance=reference, exposure=stack["exposure"], view=view)
         write_images(directory, "noisy", radiance=stack["noisy"])
         buffers = {name: stack[name] for name in ("albedo", "normal", "depth")}
-        placed = (self.frames.place(k) for k in self.shown)
-        transmits = np.stack([renderer.transmits(camera) for renderer, camera in placed])
-        lit = self._light_in_view(samples)
-        write_images(directory, "gbuffer", **buffers, transmits=transmits, light_in_view=lit)
+        renderers = (self.frames.place(k) for k in self.shown)
+        transmits = np.stack([renderer.transmits(camera) for renderer, camera in renderers])
+        light_in_view = self._light_in_view(samples)
+        write_images(directory, "gbuffer", **buffers, transmits=transmits, light_in_view=light_in_view)
 
     @staticmethod
     def _light_in_view(samples: list[Batch]) -> np.ndarray:
-        """(V,) bool: a point that emits light is seen in the sample's image."""
+        """Return (V,) bool: whether a point that emits light is visible in each sample's image."""
         batch = default_collate(samples)
         camera = {name: batch[name] for name in PROJECTION}
         emits = batch["point_visible"] & (batch["point_emission"] > 0).any(-1)
@@ -69,9 +69,9 @@ class Evaluation:
 
     @torch.inference_mode()
     def floor(self) -> tuple[dict[str, float], dict[str, float]]:
-        """The metrics of the reference's half A, judged as a prediction against half B; the MSE of each scene.
+        """Return the metrics of the reference's half A, judged as a prediction against half B, and each scene's MSE.
 
-        The metrics that need two independent halves of a reference are left out, and so are those that are not finite.
+        Metrics that need two independent halves of a reference and metrics that are not finite are left out.
         """
         metrics = ImageMetrics(perceptual=True).to(self.device)
         dataset = LightTransportDataset(self.directory, self.spec, "test", ())
@@ -86,7 +86,7 @@ class Evaluation:
 
     @torch.inference_mode()
     def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
-        """All metrics of a method; those of each view; its radiance (V, 3, H, W) of the views that are shown.
+        """Return a method's metrics, its metrics for each view, and its radiance (V, 3, H, W) of the shown views.
 
         Raises:
             DivergedError: a prediction is not finite.
@@ -101,16 +101,16 @@ class Evaluation:
             if "traced" in method.fields and method.spp:
                 cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            with self.policy.applied(self.device):  # the images that are timed
+            with self.policy.applied(self.device):  # the same computation that is timed
                 prediction = method(batch)
             if not prediction.isfinite().all():
-                raise DivergedError(f"a prediction is not finite, among test samples {indices}")
+                raise DivergedError(f"a prediction is not finite in test samples {indices}")
             reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
-            of_reference = self._of_reference(k, reference)
-            each = metrics.update(prediction, *reference, of_reference=of_reference)
-            if of_reference and "pool" in each:
-                pools.append((each.pop("pool"), of_reference["pool"]))
-            columns = {name: values.tolist() for name, values in each.items()}
+            features = self._reference_features(k, reference)
+            batch_metrics = metrics.update(prediction, *reference, of_reference=features)
+            if features and "pool" in batch_metrics:
+                pools.append((batch_metrics.pop("pool"), features["pool"]))
+            columns = {name: values.tolist() for name, values in batch_metrics.items()}
             rows += [{"view": index, **{n: c[i] for n, c in columns.items()}} for i, index in enumerate(indices)]
             shown.append(prediction[[i for i, index in enumerate(indices) if index in self.shown]].cpu())
         if pools:
@@ -124,23 +124,24 @@ class Evaluation:
     def evaluate_once(
         self, method: Method, kept: Path, key: Mapping[str, Any] | None
     ) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
-        """`evaluate`, or what it found before under the same key, which then lies in the file `kept`; None: not kept.
+        """Return the result of `evaluate`, read from the file `kept` if stored there under the same key.
 
-        So a comparison that is killed goes on where it was, and one that is given again only takes the times anew.
+        A new result is stored there, so a killed comparison resumes where it was, and a repeated one only measures
+        times. Nothing is stored if `key` is None.
         """
-        of = json.dumps(key, sort_keys=True)
+        key_text = json.dumps(key, sort_keys=True)
         if key and kept.exists():
-            with np.load(kept) as old:
-                if str(old["of"]) == of:
-                    return json.loads(str(old["metrics"])), json.loads(str(old["views"])), old["radiance"]
+            with np.load(kept) as stored:
+                if str(stored["of"]) == key_text:
+                    return json.loads(str(stored["metrics"])), json.loads(str(stored["views"])), stored["radiance"]
         metrics, views, radiance = self.evaluate(method)
         if key:
             file = io.BytesIO()
-            np.savez(file, of=of, metrics=json.dumps(metrics), views=json.dumps(views), radiance=radiance)
+            np.savez(file, of=key_text, metrics=json.dumps(metrics), views=json.dumps(views), radiance=radiance)
             write_bytes(kept, file.getvalue())
         return metrics, views, radiance
 
-    def _of_reference(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
+    def _reference_features(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
         if len(self) > _MAX_CACHED:
             return ImageMetrics.reference_features(*reference, cached=False)
         if k not in self._features:

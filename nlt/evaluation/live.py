@@ -1,4 +1,4 @@
-"""The rows of a comparison as they are printed to the terminal while it runs."""
+"""The rows of a comparison as printed in the terminal while it runs."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK
 from nlt.metrics.quantities import heading, text
 
-COLUMNS = tuple(paper()["columns"])  # of the paper's tables, in its order
-FLOOR = "reference (its halves)"  # the name of the row that judges one half of the reference against the other
+COLUMNS = tuple(paper()["columns"])  # columns of the paper's tables, in its order
+FLOOR = "reference (its halves)"  # the row that judges one half of the reference against the other
 
 
 def header() -> str:
-    """The headings above `row`."""
+    """Return the column headings for `row`."""
     return f"{'method':22}" + "".join(f"{heading(key):>18}" for key in COLUMNS)
 
 
 def floor(floor: Mapping[str, float]) -> str:
-    """The line of one half of the reference judged against the other."""
+    """Return the line of one half of the reference, judged against the other."""
     return f"{FLOOR:22}" + "".join(f"{text(key, floor.get(key)):>18}" for key in COLUMNS)
 
 
 def row(run: dict[str, Any]) -> str:
-    """The line of one run."""
+    """Return the line of one run."""
     if run["status"] != OK:
         return f"{label(run['method']):22} {run['status']}: {run['message']}"
     return f"{label(run['method']):22}" + "".join(f"{text(key, run.get(key)):>18}" for key in COLUMNS)

@@ -11,29 +11,29 @@ import yaml
 
 @cache
 def paper() -> dict[str, Any]:
-    """The content of paper.yaml."""
+    """Return the content of paper.yaml."""
     return yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text())
 
 
 def tables() -> tuple[str, ...]:
-    """The tables that it has published numbers of."""
+    """Return the names of the paper's tables."""
     return tuple(name for name, content in paper().items() if "title" in content)
 
 
 def label(method: str) -> str:
-    """The paper's name of a method; a method it lacks goes by its own. METHOD@VARIANT adds the variant."""
+    """Return the paper's name of a method, or its own if the paper lacks it; METHOD@VARIANT adds the variant."""
     name, at, variant = method.partition("@")
     return paper()["labels"].get(name, name) + f", {variant}" * bool(at)
 
 
 def order(method: str) -> tuple[int, str]:
-    """Sort key: the paper's order, then the methods it lacks by name; variants of one method are equal."""
+    """Return a sort key: the paper's order, then other methods by name; variants of a method compare equal."""
     known, name = list(paper()["labels"]), method.partition("@")[0]
     return (known.index(name) if name in known else len(known), name)
 
 
 def published(table: str | None, method: str) -> dict[str, float]:
-    """The paper's row of a method in one of `tables()`, by column; empty where it has none."""
+    """Return the paper's numbers of a method in one of `tables()`, by column; empty if it has none."""
     content = paper().get(table or "", {})
     row = content.get(method)
     return dict(zip(content.get("columns", paper()["columns"]), row, strict=True)) if row else {}

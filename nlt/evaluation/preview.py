@@ -1,4 +1,4 @@
-"""`nlt scenes preview`: what scenes look like, in random states, from random views."""
+"""`nlt scenes preview`: a contact sheet of scenes in random states, from random views."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
 _TITLE, _GAP = 24, 4  # pixels
-_KEY = 0.18  # geometric mean of luminance in a picture that is neither dark nor burnt out (Reinhard et al. 2002)
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB (ITU-R BT.709)
-_BLACK = 1e-3  # of luminance that shows
+_KEY = 0.18  # geometric mean luminance of a well-exposed picture (Reinhard et al. 2002)
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights for linear sRGB (ITU-R BT.709)
+_BLACK = 1e-3  # the least luminance that is visible; keeps the logarithm finite
 
 
 def contact_sheet(
@@ -32,37 +32,37 @@ def contact_sheet(
     experiment: str = "fixed_lights",
     seed: int = 0,
 ) -> None:
-    """Write a picture of a row per scene and a column per view, each in a random state of the experiment.
+    """Write a picture with a row per scene and a column per view, each in a random state of the experiment.
 
-    Says of each scene how bright it is at its exposure, and which exposure would suit these views.
+    Prints each scene's mean luminance at its exposure, and the exposure that would suit these views.
 
     Raises:
         UserError: a scene is unknown, does not load, or has no such experiment.
     """
-    descriptions = [load_description(name) for name in names]  # mistakes show before anything is rendered
+    descriptions = [load_description(name) for name in names]  # fails before anything is rendered
     width, height = views * (resolution + _GAP) + _GAP, resolution + _TITLE + _GAP
     sheet = Image.new("RGB", (width, len(names) * height), "white")
     draw = ImageDraw.Draw(sheet)
-    choose_variant()  # once; the processes inherit it
-    # A process per scene: Mitsuba's memory grows with every one.
+    choose_variant()  # once; child processes inherit it
+    # A process per scene, because Mitsuba's memory grows with every scene.
     for row, (name, description) in enumerate(zip(names, descriptions, strict=True)):
         images, mean = Process(_images, description, views, resolution, spp, experiment, seed).result()
-        suits = description.exposure * _KEY / mean
-        at = f"mean luminance {mean:.2g} at exposure {description.exposure:g}"
-        print(f"{name}: {at}; mid-grey, {_KEY}, at exposure {suits:.2g}", flush=True)
+        suggested = description.exposure * _KEY / mean
+        brightness = f"mean luminance {mean:.2g} at exposure {description.exposure:g}"
+        print(f"{name}: {brightness}; exposure {suggested:.2g} would give mid-grey ({_KEY})", flush=True)
         title = f"{name} ({experiment.replace('_', ' ')}, exposure {description.exposure:g}, {spp} spp)"
         draw.text((_GAP, row * height + _GAP), title, "black", font_size=14)
         for column, image in enumerate(images):
             corner = (_GAP + column * (resolution + _GAP), row * height + _TITLE)
             sheet.paste(Image.fromarray(image), corner)
     output.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(output, optimize=True, quality=90)  # of a JPEG; noise makes a PNG five times as large
+    sheet.save(output, optimize=True, quality=90)  # quality of a JPEG, which is a fifth of a noisy PNG's size
 
 
 def _images(
     description: SceneDescription, views: int, resolution: int, spp: int, experiment: str, seed: int
 ) -> tuple[list[np.ndarray], float]:
-    """(H, W, 3) uint8 sRGB images of one scene, and the geometric mean of their luminance as it is exposed."""
+    """Return a scene's (H, W, 3) uint8 sRGB images and the geometric mean of their exposed luminance."""
     use_variant()
     scene = Scene(description, experiment)
     renderer, sampler = Renderer(scene), Views(scene)

@@ -1,4 +1,4 @@
-"""Where numbers come from: command, commit, device, versions."""
+"""The provenance of results: command, commit, device, versions."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ _PACKAGES = (
     "mitsuba-oidn",
 )  # fmt: skip
 
-_CODE = ("nlt", "configs", "scripts", "benchmarks", "pyproject.toml")  # what numbers come from
+_CODE = ("nlt", "configs", "scripts", "benchmarks", "pyproject.toml")  # files that determine results
 
 
 def origin() -> dict[str, Any]:
-    """Command, commit and time, taken when the command begins: the checkout may change while it runs."""
+    """Return command, commit and time; call it at the start, because the checkout may change during the run."""
     return {
         "command": shlex.join(["nlt", *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--", *_CODE)),  # files that are not tracked, too
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--", *_CODE)),  # including untracked files
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
 
 
 def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str, Any]:
-    """What else decides a result: device, versions, how it was timed."""
+    """Return what else determines a result: device, versions, clock settings, policy."""
     variant, weights = choose_variant(), find_weights()
     return {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
@@ -59,10 +59,10 @@ def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str
 
 def _git(*arguments: str) -> str | None:
     try:
-        done = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
+        process = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()
+    return process.stdout.strip()
 
 
 def _processor() -> str:

@@ -1,4 +1,4 @@
-"""The trainings behind a comparison: independent jobs, each in a directory of its own, none made twice."""
+"""The trainings of a comparison: independent jobs, each in its own directory, none run twice."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from nlt.training import check_configs, newest_checkpoint, run_lightning
 class Training:
     """A job: a method's training with a seed, on all training images or the first `train_images` of each scene.
 
-    Its directory `run` belongs to a hash of all that decides the outcome, so a method is trained anew only when that
-    changed. There lie its checkpoints, its log, how far it is, and, once it has come to an end, what it took.
+    The name of its directory `run` has a hash of all that determines the outcome, so a method is trained again only
+    when that changes. The directory holds checkpoints, log, progress and, after the end, the outcome.
     """
 
     method: str
@@ -46,50 +46,54 @@ class Training:
     def of(
         cls, comparison: Comparison, method: str, seed: int, root: Path, train_images: int | None = None
     ) -> Training:
-        """A comparison's training, in a directory below `root`."""
+        """Create a comparison's training, with a directory below `root`."""
         files = comparison.configs(method)
         merged = read_configs(files)
         if train_images:
             merged = merge(merged, {"data": {"train_images": train_images}})
-        # What was trained on another device, in its precision, is evaluated and timed on this one as it is.
-        wanted = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
-        precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in wanted)
-        runs = {precision: root / f"{method}-{_key(merged, seed, precision)}" for precision in precisions}
+        # A method that was trained on another device, in that device's precision, is not trained again on this one.
+        choices = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
+        precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in choices)
+        runs = {precision: root / f"{method}-{_config_hash(merged, seed, precision)}" for precision in precisions}
         precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
-        # Absolute: processes elsewhere have other working directories.
+        # Absolute, because processes on other machines have other working directories.
         paths = tuple(os.path.abspath(file) for file in files)
         return cls(method, seed, runs[precision].absolute(), paths, precision, train_images)
 
     @property
     def name(self) -> str:
-        """As it is printed."""
+        """The printed name."""
         images = f", {self.train_images} images" if self.train_images else ""
         return f"{self.method}, seed {self.seed}{images}"
 
     @property
     def took(self) -> dict[str, Any] | None:
-        """What it took, or how it diverged, and its `history` (progress.py); None if it has not come to an end."""
+        """The outcome: time, steps and `history` (progress.py), or how it diverged; None before the end."""
         done = self.run / DONE
-        took = json.loads(done.read_text()) if done.exists() else None
-        return took if took and ("diverged" in took or newest_checkpoint(self.run)) else None
+        outcome = json.loads(done.read_text()) if done.exists() else None
+        return outcome if outcome and ("diverged" in outcome or newest_checkpoint(self.run)) else None
 
     def load(self, device: torch.device) -> tuple[RenderingModule, dict[str, Any]]:
-        """The trained method and what that took.
+        """Load the trained method and the facts about its training, without `history`.
 
         Raises:
-            DivergedError: it diverged, now or when it was tried before.
+            DivergedError: the training diverged, now or in an earlier comparison.
         """
-        took, checkpoint = self.took or {}, newest_checkpoint(self.run)
-        took.pop("history", None)
-        if "diverged" in took:
-            raise DivergedError(took["diverged"])
+        outcome, checkpoint = self.took or {}, newest_checkpoint(self.run)
+        outcome.pop("history", None)
+        if "diverged" in outcome:
+            raise DivergedError(outcome["diverged"])
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval()
-        return module, took | {"run": os.path.relpath(self.run)}
+        return module, outcome | {"run": os.path.relpath(self.run)}
 
 
 def check(comparison: Comparison) -> None:
-    """Raises UserError if a config of any method would not do, before the first is trained."""
+    """Check the configs of all methods, before the first is trained.
+
+    Raises:
+        UserError: a config is wrong.
+    """
     for method in comparison.methods:
         if not build_if_untrained(method):
             check_configs(comparison.configs(method))
@@ -98,48 +102,48 @@ def check(comparison: Comparison) -> None:
 def train(
     trainings: list[Training], scheduler: str, workers: int | None, slurm: Mapping[str, str]
 ) -> dict[Training, str]:
-    """Train what has not come to an end yet; what died twice, and of what.
+    """Run the trainings that have not ended yet; return those that failed twice, with the reason.
 
-    Each has a process of its own: it may be killed for its memory, and Lightning keeps state. Here these are forked
-    from one that has imported Lightning, which takes seconds.
+    Each has its own process, because it may be killed for its memory and because Lightning keeps global state. On
+    this machine they are forked from a process that has imported Lightning, which takes seconds.
 
     Raises:
         UserError: a config or the dataset is wrong, or the disk is full.
     """
-    left = [training for training in trainings if not training.took]
-    died: dict[Training, str] = {}
-    if not left:
-        return died
+    unfinished = [training for training in trainings if not training.took]
+    failures: dict[Training, str] = {}
+    if not unfinished:
+        return failures
     engine = find_engine(scheduler, workers or (1 if scheduler == "local" else None), slurm, preload=(__name__,))
-    table = ProgressTable({t.run: t.name for t in left})
-    print(f"\n{len(left)} of {len(trainings)} trainings to do, {engine.workers} side by side", flush=True)
-    with closing(engine.run(_train, left, died)) as ticks:
+    table = ProgressTable({t.run: t.name for t in unfinished})
+    print(f"\n{len(unfinished)} of {len(trainings)} trainings to run, {engine.workers} in parallel", flush=True)
+    with closing(engine.run(_train, unfinished, failures)) as ticks:
         for _ in ticks:
-            table.show({t.run: reason for t, reason in died.items()})
-    table.show({t.run: reason for t, reason in died.items()}, last=True)
-    for training in left:
-        if training not in died and not training.took:
-            raise UserError(f"{training.run}: still without {DONE}: do all machines see this directory?")
-    return {training: table.rows[training.run].message for training in died}
+            table.show({t.run: reason for t, reason in failures.items()})
+    table.show({t.run: reason for t, reason in failures.items()}, last=True)
+    for training in unfinished:
+        if training not in failures and not training.took:
+            raise UserError(f"{training.run}: {DONE} is missing; use a directory that all machines share")
+    return {training: table.rows[training.run].message for training in failures}
 
 
 def _train(training: Training, threads: int, tick: Callable[[int], None]) -> None:
-    """A job, in a process of its own; whatever it has to say goes to log.txt."""
+    """Run a job in its own process; its output goes to log.txt."""
     run = training.run
     run.mkdir(parents=True, exist_ok=True)
     with (run / "log.txt").open("ab") as log, (run / "lock").open("w") as lock:
         for stream in (1, 2):
             os.dup2(log.fileno(), stream)
-        with suppress(OSError):  # file systems without locks
-            fcntl.flock(lock, fcntl.LOCK_EX)  # until one is done that an earlier, killed comparison left in a queue
+        with suppress(OSError):  # some file systems have no locks
+            fcntl.flock(lock, fcntl.LOCK_EX)  # wait for a job that a killed comparison left in a queue
         if training.took:
             return
         torch.set_num_threads(threads)
         progress = Progress(run, tick)
         try:
-            took = _fit(training, progress) | {"threads": threads}
+            outcome = _fit(training, progress) | {"threads": threads}
         except DivergedError as error:
-            took = {"diverged": str(error)}
+            outcome = {"diverged": str(error)}
         except UserError:
             raise
         except OSError as error:
@@ -147,20 +151,20 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
         except Exception as error:
             progress.died(error)
             raise
-        write_bytes(run / DONE, json.dumps({**took, "history": progress.history}).encode())
+        write_bytes(run / DONE, json.dumps({**outcome, "history": progress.history}).encode())
 
 
-def _key(config: dict[str, Any], seed: int, precision: str) -> str:
-    decides = {key: config.get(key) for key in ("data", "model")} | {"seed": seed}
-    decides["trainer"] = {"precision": precision, **config.get("trainer", {})}
-    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
+def _config_hash(config: dict[str, Any], seed: int, precision: str) -> str:
+    inputs = {key: config.get(key) for key in ("data", "model")} | {"seed": seed}
+    inputs["trainer"] = {"precision": precision, **config.get("trainer", {})}
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _fit(training: Training, progress: Progress) -> dict[str, Any]:
-    """Train, from the newest checkpoint if there is one; what that took."""
-    own = training.run / "run.yaml"
-    own.write_text(yaml.safe_dump(_run_config(training)))
-    arguments = ["fit", *(f"--config={file}" for file in (*training.files, own))]
+    """Train, from the newest checkpoint if there is one, and return the facts about the training."""
+    run_config = training.run / "run.yaml"
+    run_config.write_text(yaml.safe_dump(_run_config(training)))
+    arguments = ["fit", *(f"--config={file}" for file in (*training.files, run_config))]
     checkpoint = newest_checkpoint(training.run)
     if checkpoint:
         print(f"resuming from {checkpoint}", flush=True)
@@ -176,7 +180,7 @@ def _fit(training: Training, progress: Progress) -> dict[str, Any]:
 
 
 def _run_config(training: Training) -> dict[str, Any]:
-    # Hyperparameters are logged when the metrics are known: nlt/report/dashboard.py.
+    # nlt/report/dashboard.py logs hyperparameters, once the metrics are known.
     logger = {"save_dir": str(training.run), "name": "", "version": "", "default_hp_metric": False}
     trainer = read_configs(list(training.files)).get("trainer") or {}
     return {
@@ -184,9 +188,9 @@ def _run_config(training: Training) -> dict[str, Any]:
         "model": {"init_args": {"seed": training.seed}},
         "data": {"seed": training.seed} | ({"train_images": training.train_images} if training.train_images else {}),
         "trainer": {
-            # Not what a machine elsewhere would choose: the directory belongs to this one.
+            # Set here, because another machine might choose another precision than the one in the directory's hash.
             "precision": trainer.get("precision", training.precision),
-            # Side by side are jobs; and Lightning's processes for more devices would run the whole command.
+            # Jobs run in parallel instead; Lightning's processes for more devices would run the whole command.
             "devices": trainer.get("devices", 1),
             "enable_model_summary": False,
             "enable_progress_bar": False,

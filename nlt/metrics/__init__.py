@@ -1,1 +1,1 @@
-"""torchmetrics Metrics and the one display transform."""
+"""Image metrics as torchmetrics Metrics, and the display transform."""

@@ -1,4 +1,4 @@
-"""Inception's features of the images that methods are compared with, kept on disk by the images' content."""
+"""A disk cache of Inception's features of reference images, keyed by the images' content."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from nlt.paths import cache_root
 
 
 def cached_features(inception: Inception, images: Tensor) -> dict[str, Tensor]:
-    """`inception(images)`, of images (B, 3, H, W), computed once for all runs of this user.
+    """Return `inception(images)` for images (B, 3, H, W), computed once for all runs of this user.
 
-    The file in `cache_root()` is named by the images' content and whatever computes the features, has a CRC for every
-    array, and appears under its name when it is whole; a damaged one is written anew. 4 MB an image.
+    The cache key is a hash of the images and of everything that affects their features. The file in `cache_root()` has
+    a CRC for every array and 4 MB per image. It is written atomically, and replaced if it is damaged.
     """
     images = images.float()
     definition = f"{inception.definition} {torch.__version__} {images.device.type} {tuple(images.shape)}"
@@ -33,6 +33,6 @@ def cached_features(inception: Inception, images: Tensor) -> dict[str, Tensor]:
     except UserError:  # missing or damaged
         features = inception(images)
     arrays = {name: feature.contiguous().cpu().numpy() for name, feature in features.items()}
-    with suppress(UserError, OSError):  # no space, or not ours to write: it is only a cache
+    with suppress(UserError, OSError):  # an unwritable cache is not an error
         write_shard(path, [{name: array[row] for name, array in arrays.items()} for row in range(len(images))])
     return features

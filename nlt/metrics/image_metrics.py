@@ -1,4 +1,4 @@
-"""The metrics of a predicted image against its two reference halves; `METRICS` of quantities.py describes them."""
+"""Metrics of a predicted image against its two reference halves; `METRICS` in quantities.py describes them."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
 SLOW = ("flip", *PERCEPTUAL)
 
-# MSSIM as in Wang et al. 2004, with the paper's uniform 7 x 7 window and the image mirrored at its border.
+# MSSIM as in Wang et al. 2004, with the paper's uniform 7 x 7 window and mirrored borders.
 _SSIM: dict[str, Any] = {"gaussian_kernel": False, "kernel_size": 7, "data_range": 1.0}
 
 
 def unbiased_mse(prediction: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Mean of (f - A)(f - B) of each image (B, 3, H, W), in radiance times exposure: (B,).
+    """Return the mean of (f - A)(f - B) over each image (B, 3, H, W), in radiance times exposure: (B,).
 
-    A and B are independent halves of the reference: their noise is independent, of mean 0 and independent of
-    f, so the expectation is the MSE against the noise-free image, whereas that against (A + B) / 2 also
-    contains its variance. As an estimate it may be negative.
+    The noise of the reference halves A and B has mean 0 and is independent of the other half and of f. The expectation
+    is therefore the MSE against the noise-free image, whereas the MSE against (A + B) / 2 also contains the variance of
+    that mean. The estimate can be negative.
     """
     return ((prediction - a) * (prediction - b)).mean((1, 2, 3))
 
 
 def reference_noise(a: Tensor, b: Tensor) -> Tensor:
-    """Mean of (A - B)² / 4 of each image, in radiance times exposure: the variance of the reference (A + B) / 2."""
+    """Return the mean of (A - B)² / 4 over each image, (B,): the variance of the reference (A + B) / 2."""
     return (a - b).square().mean((1, 2, 3)) / 4
 
 
 def flip(shown: Tensor, target: Tensor) -> Tensor:
-    """Mean LDR-FLIP (Andersson et al. 2020) of each pair of sRGB images (B, 3, H, W): (B,), at 67 pixels per degree.
+    """Return the mean LDR-FLIP (Andersson et al. 2020) of each pair of sRGB images (B, 3, H, W): (B,).
 
-    NaN where an image is not finite, which the library would not notice.
+    It assumes 67 pixels per degree. The result is NaN if an image is not finite, which the library does not check.
     """
     values = []
     for pair in zip(target, shown, strict=True):
@@ -55,10 +55,10 @@ def flip(shown: Tensor, target: Tensor) -> Tensor:
 
 
 def feature_l1(prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Mean absolute difference of Inception's features of each image, by the keys of `METRICS`: (B,) each.
+    """Return the mean absolute difference of Inception's features of each image, by the keys of `METRICS`: (B,) each.
 
-    "feature_l1", on the final average pooling, is the paper's Feature L1; the others are on the maps of the
-    four stages, before pooling.
+    "feature_l1" compares the final average pooling and is the paper's Feature L1; the others compare the maps of the
+    four stages before pooling.
     """
     layers = {"feature_l1": "pool", **{f"feature_l1_{stage}": stage for stage in STAGES}}
     difference = lambda layer: (prediction[layer] - reference[layer]).abs()
@@ -67,40 +67,41 @@ def feature_l1(prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> d
 
 
 class _FeatureDistance(KernelInceptionDistance):
-    """Keeps the pooled features (N, 2048) of both sets of images."""
+    """Collects the pooled features (N, 2048) of predictions and references."""
 
     def __init__(self) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that it keeps all features
+            warnings.simplefilter("ignore", UserWarning)  # it warns that it keeps all features
             super().__init__(feature=nn.Identity())
-        for name in ("real_features", "fake_features"):  # "cat": processes may have had different numbers of batches
+        for name in ("real_features", "fake_features"):  # "cat" allows different numbers of batches per process
             self.add_state(name, [], dist_reduce_fx="cat")
 
     def features(self) -> tuple[Tensor, Tensor]:
-        """Of the predictions, and of the references."""
+        """Return the features of the predictions and those of the references."""
         return dim_zero_cat(self.fake_features), dim_zero_cat(self.real_features)
 
 
 class FID(_FeatureDistance):
     """Fréchet distance of Gaussians fitted to the pooled features (N, 2048), in float64.
 
-    torchmetrics' own, of the same value, takes seconds for the eigenvalues of a 2048 x 2048 matrix. NaN below two
-    samples. Small N biases it upwards: compare only values of the same N and the same reference images.
+    torchmetrics' FID gives the same value, but takes seconds for the eigenvalues of a 2048 x 2048 matrix. The FID is
+    NaN for fewer than two samples. A small N biases it upwards, so compare only values with equal N and references.
     """
 
     def compute(self) -> Tensor:  # type: ignore[override]
-        """Scalar."""
+        """Return the distance, a scalar."""
         return frechet_distance(*self.features())
 
 
 class KID(_FeatureDistance):
-    """Kernel distance of the pooled features (N, 2048): unbiased at any N, so comparable over sizes.
+    """Kernel distance of the pooled features (N, 2048). It is unbiased, so values with different N are comparable.
 
-    Up to 1000 samples, all are compared at once; of more, 100 random subsets of 1000. NaN below two samples.
+    Up to 1000 samples are compared at once; with more, 100 random subsets of 1000 are used. The KID is NaN for fewer
+    than two samples.
     """
 
     def compute(self) -> Tensor:  # type: ignore[override]
-        """Scalar."""
+        """Return the distance, a scalar."""
         count = len(self.features()[1])
         if count < 2:
             return torch.full((), torch.nan, device=self.device)
@@ -111,10 +112,10 @@ class KID(_FeatureDistance):
 
 
 class ImageMetrics(nn.Module):
-    """All of `METRICS`; without `perceptual` only those that are quick.
+    """All of `METRICS` or, without `perceptual`, only those that are fast.
 
-    The metrics are submodules, so they move and synchronise with the module that owns this one. Inception
-    is not: it must not end up in checkpoints. Without its weights the metrics that need it are NaN.
+    The metrics are submodules, so they move and synchronise with the module that owns this one. Inception is not a
+    submodule, so checkpoints do not contain it. Without its weights, the metrics that need it are NaN.
     """
 
     def __init__(self, perceptual: bool) -> None:
@@ -137,17 +138,17 @@ class ImageMetrics(nn.Module):
         exposure: Tensor,
         of_reference: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Add a batch: linear radiance (B, 3, H, W), W·sr⁻¹·m⁻², and the scenes' exposure (B,) or scalar.
+        """Add a batch and return the metrics of each image (B,), by the keys of `METRICS`.
 
-        `of_reference`: what `reference_features` gave for it, when several methods share a reference.
-        Returns the metrics of each image (B,), by the keys of `METRICS`, and, where Inception has been run,
-        its pooled features (B, 2048) as "pool".
+        Images are linear radiance (B, 3, H, W), W·sr⁻¹·m⁻²; the scenes' exposure is (B,) or scalar. `of_reference` is
+        the result of `reference_features` if several methods share a reference. If Inception was run, its pooled
+        features (B, 2048) of the prediction are returned as "pool".
         """
         f, a, b, shown, target = _domains(prediction, reference_a, reference_b, exposure)
         mssim = structural_similarity_index_measure(shown, target, reduction="none", **_SSIM)
         assert isinstance(mssim, Tensor)
         mse = (shown - target).square().mean((1, 2, 3))
-        each = {
+        values = {
             "mse": mse,
             "unbiased_mse": unbiased_mse(f, a, b),
             "reference_noise": reference_noise(a, b),
@@ -155,27 +156,27 @@ class ImageMetrics(nn.Module):
             "mssim": mssim,
         }
         if self.perceptual:
-            each["flip"] = flip(shown, target)
+            values["flip"] = flip(shown, target)
             if inception := load_inception(f.device):
-                # One pass for all perceptual metrics; prediction and reference apart to halve the memory.
-                of_prediction, of_reference = inception(shown), of_reference or inception(target)
-                each |= feature_l1(of_prediction, of_reference)
+                # One pass serves all perceptual metrics; prediction and reference are separate to halve the memory.
+                shown_features, of_reference = inception(shown), of_reference or inception(target)
+                values |= feature_l1(shown_features, of_reference)
                 for distance in (self.fid, self.kid):
-                    distance.update(of_prediction["pool"].double(), real=False)
+                    distance.update(shown_features["pool"].double(), real=False)
                     distance.update(of_reference["pool"].double(), real=True)
-                each["pool"] = of_prediction["pool"]
+                values["pool"] = shown_features["pool"]
             else:
-                each |= {key: torch.full_like(mse, torch.nan) for key in PERCEPTUAL if METRICS[key].per_image}
+                values |= {key: torch.full_like(mse, torch.nan) for key in PERCEPTUAL if METRICS[key].per_image}
         for key, mean in self.means.items():
-            mean.update(each[key])
-        return each
+            mean.update(values[key])
+        return values
 
     @staticmethod
     @torch.no_grad()
     def reference_features(
         reference_a: Tensor, reference_b: Tensor, exposure: Tensor, cached: bool
     ) -> dict[str, Tensor] | None:
-        """Inception's features of a reference, for `update`, `cached` on disk; None without the weights."""
+        """Return Inception's features of a reference for `update`, `cached` on disk, or None without the weights."""
         target = _domains(reference_a, reference_a, reference_b, exposure)[-1]
         inception = load_inception(target.device)
         if inception is None:
@@ -183,7 +184,7 @@ class ImageMetrics(nn.Module):
         return cached_features(inception, target) if cached else inception(target)
 
     def compute(self) -> dict[str, Tensor]:
-        """Scalars over all updates, of all processes, by the keys of `METRICS`."""
+        """Return scalars over all updates in all processes, by the keys of `METRICS`."""
         values = self.means.compute()
         if self.perceptual and load_inception(values["mse"].device):
             values |= {"fid": self.fid.compute(), "kid": self.kid.compute()}
@@ -192,7 +193,7 @@ class ImageMetrics(nn.Module):
         return {key: values[key] for key in METRICS if key in values}
 
     def reset(self) -> None:
-        """Forget all updates."""
+        """Discard all updates."""
         for metric in self.modules():
             if isinstance(metric, Metric):
                 metric.reset()
@@ -201,9 +202,9 @@ class ImageMetrics(nn.Module):
 def _domains(
     prediction: Tensor, reference_a: Tensor, reference_b: Tensor, exposure: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """f, A and B times exposure, and prediction and reference for display.
+    """Return f, A and B times exposure, and prediction and reference as displayed.
 
-    In float64, which neither autocast nor TF32 touches: SSIM's variances are small differences.
+    All are float64, which neither autocast nor TF32 affects, because SSIM's variances are small differences.
     """
     f, a, b = prediction.double(), reference_a.double(), reference_b.double()
     shown, target = display(f, exposure), display((a + b) / 2, exposure)

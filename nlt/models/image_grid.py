@@ -1,4 +1,4 @@
-"""TensorBoard images during training: noisy input, prediction, reference and error of a few samples."""
+"""TensorBoard images during training: noisy target, prediction, reference and error of a few samples."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ from nlt.metrics.display import display
 
 
 class ImageGrid(L.Callback):
-    """Adds the image "val/images", a row each for the first `images` samples.
+    """Logs the image "val/images", with one row for each of the first `images` samples.
 
-    Drawn at the first validation, then at the first one `every_n_epochs` or more epochs after the last drawn.
-
-    Columns, as displayed: noisy (where the batch has it), prediction, reference, absolute difference of the
-    last two. Does nothing without a TensorBoard logger and on ranks other than 0.
+    The image is drawn at the first validation, then at the first validation that is at least `every_n_epochs` epochs
+    after the last image. The columns, after the display transform: noisy target, prediction, reference, and the
+    absolute difference of the last two. Does nothing without a TensorBoard logger and on ranks other than 0.
     """
 
     def __init__(self, every_n_epochs: int = 5, images: int = 4) -> None:
         self.every_n_epochs = every_n_epochs
         self.images = images
         self._rows: list[Tensor] = []
-        self._drawn: int | None = None  # the epoch of the last
+        self._drawn: int | None = None  # epoch of the last image
 
     def _active(self, trainer: L.Trainer) -> bool:
-        # Not epochs divisible by it: validation may never fall on one.
+        # Counted from the last image: validation may never fall on a multiple of every_n_epochs.
         due = self._drawn is None or trainer.current_epoch - self._drawn >= self.every_n_epochs
         return due and trainer.is_global_zero and not trainer.sanity_checking
 

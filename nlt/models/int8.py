@@ -1,4 +1,4 @@
-"""Convolutions in 8-bit integers: twice as fast as in bfloat16 where the processor has VNNI; at inference only."""
+"""8-bit integer convolutions for inference: twice as fast as bfloat16 on processors with VNNI."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-_STEPS = 253  # of an input, at least: in bfloat16, 255 and the half that rounds would be 256, which is 0 as a byte
-_LEAST = 1e-30  # largest value of an image
-_BLOCK = 1 << 20  # values that are rounded at a time: few enough for the cache, enough for several threads
+_STEPS = 253  # steps of an input, at least; in bfloat16, 255 plus the half for rounding is 256, which wraps to 0
+_LEAST = 1e-30  # lower bound on an image's maximum, by which its scale is divided
+_BLOCK = 1 << 20  # values rounded at a time: few enough for the cache, enough for several threads
 
 
 class PackedWeights(NamedTuple):
-    """Of a convolution, rounded to 127 steps of each output channel's largest, and laid out for the processor."""
+    """A convolution's weights, rounded to 127 steps of each output channel's largest and laid out for the processor."""
 
     weights: Tensor
     scales: Tensor
@@ -24,7 +24,7 @@ class PackedWeights(NamedTuple):
 
 
 def pack(conv: nn.Conv2d) -> PackedWeights:
-    """The weights of a convolution of groups 1 and zeros around."""
+    """Pack the weights of a convolution without groups and with zero padding."""
     weight = conv.weight.detach().float()
     scales = (weight.abs().amax((1, 2, 3)) / 127).clamp(min=torch.finfo(torch.float32).tiny)
     rounded = (weight / scales[:, None, None, None]).round().to(torch.int8)
@@ -37,18 +37,18 @@ def pack(conv: nn.Conv2d) -> PackedWeights:
 
 
 def convolve(conv: nn.Conv2d, x: Tensor, packed: MutableMapping[nn.Module, PackedWeights], relu: bool) -> Tensor:
-    """conv(x), of which with `relu` the positive part: x (B, C, H, W) bfloat16, not negative, to bfloat16.
+    """Return conv(x) in bfloat16, followed by a ReLU if `relu`; x (B, C, H, W) is bfloat16 and not negative.
 
-    Every image of x is rounded to 253 steps of its largest value, or one more. `packed` keeps the weights.
+    Every image of x is rounded to 253 steps of its largest value, or one more. `packed` caches the packed weights.
     """
     if conv not in packed:
         packed[conv] = pack(conv)
     weights, scales, zeros, bias = packed[conv]
     images = []
-    for image in x.split(1):  # each by its own scale, so that an image does not depend on its batch
+    for image in x.split(1):  # one scale per image, so that an image does not depend on its batch
         top = image.amax().float().clamp(min=_LEAST)
-        steps = float((_STEPS / top).bfloat16())  # per unit, as the addition in bfloat16 will take them
-        step = 1 / steps if steps > 0 else math.nan  # of what is not finite
+        steps = float((_STEPS / top).bfloat16())  # per unit of x, rounded to bfloat16 as `_rounded` will use it
+        step = 1 / steps if steps > 0 else math.nan  # NaN if the image is not finite
         images.append(
             torch.ops.onednn.qconv2d_pointwise(
                 _rounded(image, steps), step, 0, weights, scales, zeros, bias, *_geometry(conv), 1,
@@ -59,7 +59,7 @@ def convolve(conv: nn.Conv2d, x: Tensor, packed: MutableMapping[nn.Module, Packe
 
 
 def _rounded(x: Tensor, steps: float) -> Tensor:
-    """x * steps in uint8; by way of int16, for PyTorch converts bfloat16 to bytes one by one."""
+    """Return x * steps rounded to uint8, via int16: PyTorch does not vectorize the conversion of bfloat16 to bytes."""
     out = torch.empty_like(x, dtype=torch.uint8)
     rows = max(1, _BLOCK // (x.shape[1] * x.shape[3]))
     for source, target in zip(x.split(rows, 2), out.split(rows, 2), strict=True):

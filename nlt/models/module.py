@@ -1,4 +1,4 @@
-"""What all methods share: U-Net, loss, optimiser, logging, metrics; a method says what feeds the U-Net."""
+"""The base class of trained methods: U-Net, loss, optimiser, logging, metrics. A method defines the U-Net's input."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from nlt.models.projection import SparseMap, average_sparsely, project, visible_
 from nlt.models.transport import PointEmbedding
 from nlt.models.unet import UNet
 
-# The names in a batch that the two shared inputs read.
+# Batch fields that the G-buffer input and the projection read.
 GBUFFER = ("depth", "normal", "albedo", "view_direction")
 PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
 GBUFFER_CHANNELS = 10
 
-_WARM_UP = 0.05  # share of the steps, with the schedule "cosine"
+_WARM_UP = 0.05  # share of the steps, with lr_schedule "cosine"
 
-Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), which are valid (B, N)
+Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), validity (B, N)
 Features = Tensor | tuple[Tensor, list[SparseMap]]
 
-# What checkpoints have that were written before it could be chosen.
+# Values of these hyperparameters in checkpoints that were written before they could be chosen.
 _FIXED = {"points": True, "point_width": 64, "photon_width": 64, "output": "radiance", "add_emission": True}
 
 
 def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
-    """log(1 + exposure * radiance), of (B, ...) and (B,).
+    """Return log(1 + exposure * radiance) of a radiance (B, ...) and an exposure (B,).
 
-    Network inputs of high dynamic range go through this: a lamp or a firefly is orders of magnitude above
-    the rest, and fed linearly would swamp every feature it is mixed with.
+    Network inputs of high dynamic range are compressed this way: a lamp or a firefly is orders of magnitude brighter
+    than the rest, and its linear value would swamp every feature it is mixed with.
     """
     return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
 
 
 def warm_up_and_cosine(step: int, steps: int) -> float:
-    """The factor to the learning rate at a step, out of `steps`: up to 1 in the first 5 %, then down to 0."""
+    """Return the learning rate's factor at `step` of `steps`: a rise to 1 in the first 5 %, then half a cosine to 0."""
     warm_up = math.ceil(_WARM_UP * steps)
     if step < warm_up:
         return (step + 1) / warm_up
@@ -57,17 +57,17 @@ def warm_up_and_cosine(step: int, steps: int) -> float:
 
 
 def join(maps: Sequence[Tensor]) -> Tensor:
-    """Maps (B, C, H, W) to one of all their channels, in the layout and precision that the convolutions read."""
+    """Concatenate maps (B, C, H, W) along the channels, in the layout and precision that the convolutions read."""
     device = maps[0].device.type
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps[0].dtype
     return torch.cat([x.to(dtype, memory_format=torch.channels_last) for x in maps], dim=1)
 
 
 class RenderingModule(Method, L.LightningModule):
-    """Base of all methods that are trained. A subclass gives `feature_channels`, `inputs`, `stages` and `features`.
+    """The base of all trained methods. A subclass defines `feature_channels`, `inputs`, `stages` and `features`.
 
-    A frame is three steps, which can be timed apart: `transport` (3D), `features` (projection, and what else
-    feeds the U-Net) and `synthesize` (2D).
+    A frame takes three steps, which can be timed separately: `transport` (3D), `features` (projection and all other
+    inputs of the U-Net) and `synthesize` (2D).
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
@@ -94,31 +94,31 @@ class RenderingModule(Method, L.LightningModule):
         max_photons: int | None = None,
         seed: int = 0,
     ) -> None:
-        """Defaults are the paper's.
+        """The defaults are the paper's.
 
         Args:
             width: feature maps of the U-Net's first level.
             depth: number of times the U-Net halves the resolution.
-            point_width: features of a point, even; of methods with a PointNet.
-            photon_width: features of a photon; of methods with a photon network.
+            point_width: number of features of a point, even; used by methods with a PointNet.
+            photon_width: number of features of a photon; used by methods with a photon network.
             output: how the U-Net's channels become an image. "radiance" is the paper's: three channels are the image.
-                "demodulated": albedo times the first three channels, plus the last three. A method that is not given
-                the albedo predicts radiance either way.
+                "demodulated": albedo times the first three channels, plus the last three. A method without the albedo
+                as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
-            loss: a function in nlt.models.losses.
-            learning_rate: the rate of Adam; with the schedule "cosine", its peak.
+            loss: name of a function in nlt.models.losses.
+            learning_rate: Adam's learning rate; with the schedule "cosine", its peak.
             lr_schedule: "paper" multiplies the rate by `lr_decay` after each epoch. "cosine" changes it at every step:
                 a linear warm-up over the first 5 % of the steps, then half a cosine down to zero.
-            lr_decay: factor to the learning rate after each epoch, with the schedule "paper".
-            embedding_lr: factor to the learning rate of what is learned of each point.
-            embedding_decay: weight decay, apart from the gradient (Loshchilov and Hutter 2019), of the same.
-            clip_share: share of the steps, from the first, in which the trainer's gradient_clip_val applies.
+            lr_decay: factor on the learning rate after each epoch, with the schedule "paper".
+            embedding_lr: factor on the learning rate of the point embeddings.
+            embedding_decay: decoupled weight decay (Loshchilov and Hutter 2019) of the point embeddings.
+            clip_share: share of the steps, from the first on, in which the trainer's gradient_clip_val applies.
             num_scenes: scenes in the dataset; linked from the data.
             num_points: points per scene; linked from the data.
-            max_points: use so many of them; None for all.
-            max_photons: use so many photons of a sample, each with more flux; None for all.
-            seed: of what a method draws at random in training.
+            max_points: number of points that are used; None for all.
+            max_photons: number of a sample's photons that are used, with their total flux kept; None for all.
+            seed: seed of the random numbers that a method draws in training.
         """
         super().__init__()
         transport = (("point_width", point_width, 2), ("photon_width", photon_width, 1))
@@ -133,23 +133,23 @@ class RenderingModule(Method, L.LightningModule):
         if point_width % 2:
             raise UserError(f"model.init_args.point_width: must be even, is {point_width}")
         self.save_hyperparameters()
-        self.hparams["num_points"] = min(num_points, max_points or num_points)  # the embeddings that it has
+        self.hparams["num_points"] = min(num_points, max_points or num_points)  # the number of embeddings per scene
         self.loss = getattr(losses, loss)
-        # channels_last: the convolutions' fastest layout
+        # channels_last is the fastest layout of the convolutions.
         unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)
         self.unet = unet.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._metrics: list[ImageMetrics] = []  # a list hides it from the parameters and the checkpoint
+        self._metrics: list[ImageMetrics] = []  # in a list, which keeps them out of the parameters and the checkpoint
 
-    # --- what a method is ---
+    # --- what a method defines ---
 
     @property
     def feature_channels(self) -> int:
-        """Channels of what `features` returns."""
+        """Number of channels that `features` returns."""
         raise NotImplementedError
 
     @property
     def demodulates(self) -> bool:
-        """Whether the U-Net's output is multiplied by the albedo: see the argument `output`."""
+        """Whether the U-Net's output is multiplied by the albedo; see the argument `output`."""
         return self.hparams["output"] == "demodulated" and "albedo" in self.inputs
 
     @property
@@ -158,52 +158,52 @@ class RenderingModule(Method, L.LightningModule):
 
     @property
     def state_inputs(self) -> tuple[str, ...]:
-        """The batch fields that do not depend on the camera: all that `transport` may read."""
+        """The batch fields that do not depend on the camera, which are all that `transport` may read."""
         return (*(name for name in self.inputs if name.startswith(("point_", "photon_"))), "scene", "exposure")
 
     def transport(self, batch: Batch) -> Any:
-        """Light transport, of the `state_inputs`: whatever `features` takes up again; None for a method without."""
+        """Compute light transport from the `state_inputs`, as an input of `features`; None in methods without any."""
         return None
 
     def features(self, batch: Batch, transported: Any = None) -> Features:
-        """The U-Net's input (B, feature_channels, H, W), from the batch and what `transport` returned.
+        """Return the U-Net's input (B, feature_channels, H, W), from the batch and the result of `transport`.
 
-        Or its first channels, and maps of the others: see `nlt.models.policy.Policy.sparse`.
+        With `nlt.models.policy.Policy.sparse`, return the input's first channels and sparse maps of the others.
         """
         raise NotImplementedError
 
-    # --- what methods share ---
+    # --- what all methods share ---
 
     def gbuffer(self, batch: Batch) -> Tensor:
-        """(B, 10, H, W): depth, normal, albedo and view direction."""
+        """Return depth, normal, albedo and view direction (B, 10, H, W)."""
         return join([batch[name] for name in GBUFFER])
 
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
-        """Eq. (1) with the batch's camera: features (B, N, C) at positions (B, N, 3) to (B, C, H, W)."""
+        """Project features (B, N, C) at positions (B, N, 3) to (B, C, H, W) by Eq. (1), with the batch's camera."""
         camera = (batch["camera_matrix"], batch["world_to_view"])
         return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
     def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud]) -> Features:
-        """The G-buffer and behind it each cloud's own map; a mean over all would mix their kinds of feature."""
+        """Return the G-buffer followed by one map per cloud; one mean over all would mix their kinds of feature."""
         gbuffer = self.gbuffer(batch)
         if project_sparsely(max((len(valid[0]) for *_, valid in clouds), default=0), gbuffer[0, 0].numel()):
             view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
-            found = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
-            return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in found]
+            projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
+            return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]
         return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds)])
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
-        """Features to linear radiance (B, 3, H, W)."""
+        """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""
         dense, sparse = (features, []) if isinstance(features, Tensor) else features
         channels = self.unet(dense.contiguous(memory_format=torch.channels_last), sparse)
-        # Out of the layout and, under autocast, the precision that the convolutions ran in.
+        # Leave the convolutions' layout and, under autocast, their precision.
         return self.to_radiance(batch, channels.contiguous().to(batch["exposure"].dtype))
 
     def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
-        """The U-Net's output (B, 3 or 6, H, W), in exposed radiance, as linear radiance (B, 3, H, W).
+        """Convert the U-Net's output (B, 3 or 6, H, W), in exposed radiance, to linear radiance (B, 3, H, W).
 
-        It is affine in the output either way, so that Lemma 1 holds: the gradient towards a noisy, unbiased target has
-        the expectation of the gradient towards the noise-free one.
+        The radiance is affine in the output either way, so Lemma 1 holds: the expected gradient for a noisy, unbiased
+        target is the gradient for the noise-free one.
         """
         if not self.demodulates:
             return expose(channels, 1 / batch["exposure"])
@@ -213,7 +213,7 @@ class RenderingModule(Method, L.LightningModule):
 
     @property
     def has_point_embeddings(self) -> bool:
-        """Whether something is learned of each point, which holds for these scenes' points alone."""
+        """Whether the method learns embeddings, which are valid for the training scenes' points only."""
         return any(isinstance(part, PointEmbedding) for part in self.modules())
 
     @property
@@ -221,19 +221,19 @@ class RenderingModule(Method, L.LightningModule):
         return self.hparams["max_photons"]
 
     def subsample(self, batch: Batch) -> Batch:
-        """The batch with `max_points` points and `max_photons` photons at most; the photons' flux sums to the same."""
+        """Return the batch with at most `max_points` points and `max_photons` photons, whose total flux is kept."""
         points, photons = self.hparams["max_points"], self.hparams["max_photons"]
-        if points:  # in the order in which they were drawn: any of them are a uniform sample
+        if points:  # they are in random order, so the first ones are a uniform sample
             batch = {k: v[:, :points] if k.startswith("point_") else v for k, v in batch.items()}
         total = batch["photon_flux"].shape[1] if "photon_flux" in batch else 0
-        if photons and total > photons:  # they lie by emitter: of each its share
+        if photons and total > photons:  # they are sorted by emitter; equal strides keep each one's share
             chosen = ((torch.arange(photons, device=batch["photon_flux"].device) + 0.5) * (total / photons)).long()
             batch = {k: v[:, chosen] if k.startswith("photon_") else v for k, v in batch.items()}
             batch["photon_flux"] = batch["photon_flux"] * (total / photons)
         return batch
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
-        """Transport, projection, synthesis."""
+        """Return the steps "transport", "projection" and "synthesis"."""
         transport = lambda batch, _: self.transport(self.subsample(batch))
         features = lambda batch, transported: self.features(self.subsample(batch), transported)
         return {"transport": transport, "projection": features, "synthesis": self.synthesize}
@@ -254,11 +254,11 @@ class RenderingModule(Method, L.LightningModule):
     def configure_optimizers(self) -> Any:
         chosen = self.hparams
         rate, embeddings = chosen["learning_rate"], self._embeddings()
-        known = {id(parameter) for parameter in embeddings}
-        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if id(p) not in known]}]
+        embedding_ids = {id(parameter) for parameter in embeddings}
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if id(p) not in embedding_ids]}]
         if embeddings:
-            own = {"lr": rate * chosen["embedding_lr"], "weight_decay": chosen["embedding_decay"]}
-            groups.append({"params": embeddings, **own})
+            options = {"lr": rate * chosen["embedding_lr"], "weight_decay": chosen["embedding_decay"]}
+            groups.append({"params": embeddings, **options})
         optimizer = torch.optim.Adam(groups, lr=rate, decoupled_weight_decay=True, fused=True)
         if chosen["lr_schedule"] == "paper":
             return [optimizer], [ExponentialLR(optimizer, gamma=chosen["lr_decay"])]
@@ -272,9 +272,9 @@ class RenderingModule(Method, L.LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: Any = None, gradient_clip_algorithm: Any = None
     ) -> None:
-        """Clip as the trainer says, in the first `clip_share` of the steps.
+        """Clip gradients as the trainer is configured, in the first `clip_share` of the steps.
 
-        Lightning's own method refuses a fused Adam in mixed precision, but here no loss is scaled.
+        Lightning's own method rejects a fused Adam in mixed precision, which is safe here because no loss is scaled.
         """
         share = self.hparams["clip_share"]
         if gradient_clip_val and (share == 1 or self.global_step < share * self.trainer.estimated_stepping_batches):
@@ -294,7 +294,7 @@ class RenderingModule(Method, L.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Tensor:
         prediction = self._evaluation_step(batch)
-        # Against the noisy target too, to stand beside train/loss.
+        # Against the noisy target, to be comparable with train/loss.
         loss = self.loss(prediction, batch["noisy"], batch["exposure"])
         self.log("val/loss", loss, batch_size=len(batch["scene"]))
         return prediction
@@ -315,16 +315,20 @@ class RenderingModule(Method, L.LightningModule):
 
     @classmethod
     def class_path(cls) -> str:
-        """Import path: the method's identity in a checkpoint."""
+        """Return the import path, which identifies the method in a checkpoint."""
         return f"{cls.__module__}.{cls.__qualname__}"
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        # Not left to "hyper_parameters": load_from_checkpoint overwrites those with its arguments.
+        # Not taken from "hyper_parameters", which load_from_checkpoint overwrites with its arguments.
         checkpoint["method"] = self.class_path()
         checkpoint["architecture"] = {name: self.hparams[name] for name in self.architecture}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Raises UserError if the checkpoint is of another method or another size."""
+        """Check that the checkpoint fits this method.
+
+        Raises:
+            UserError: the checkpoint is of another method or another size.
+        """
         path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
@@ -341,11 +345,12 @@ class RenderingModule(Method, L.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: str | Path, *args: Any, **kwargs: Any
     ) -> RenderingModule:
-        """As Lightning's. `RenderingModule.load_from_checkpoint` takes a checkpoint of any method.
+        """Load a checkpoint as Lightning does; `RenderingModule.load_from_checkpoint` accepts one of any method.
 
-        Raises UserError if the checkpoint is not of `cls`, or `kwargs` change its size.
+        Raises:
+            UserError: the checkpoint is not of `cls`, or `kwargs` change its size.
         """
-        # Before Lightning builds `cls` from hyperparameters that may be another method's; meta: no tensors.
+        # Checked before Lightning builds `cls` from another method's hyperparameters; "meta" loads no tensors.
         checkpoint = torch.load(checkpoint_path, map_location="meta", weights_only=True)
         module, _, name = str(checkpoint.get("method", "")).rpartition(".")
         try:

@@ -1,4 +1,4 @@
-"""Further views of a state, without computing anew what does not depend on the camera."""
+"""Further views of a scene state, without recomputing what does not depend on the camera."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from nlt.models.module import RenderingModule
 
 
 class MovingCamera:
-    """A trained method at inference, whose light transport is kept for as long as the scene's state stays the same.
+    """A trained method at inference that reuses its light transport while the scene's state stays the same.
 
-    A further view then costs the G-buffer, projection and synthesis, and the image is the same to the bit.
+    A further view then costs only the G-buffer, projection and synthesis, and its image is bitwise identical.
     """
 
     def __init__(self, method: RenderingModule) -> None:
@@ -24,9 +24,9 @@ class MovingCamera:
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> Tensor:
-        """As the method: from a batch to radiance (B, 3, H, W)."""
+        """Return the radiance (B, 3, H, W) of a batch, as the method does."""
         state = {name: batch[name] for name in self.method.state_inputs}
         if state.keys() != self._state.keys() or not all(torch.equal(state[name], self._state[name]) for name in state):
             self._transported = self.method.transport(state)
-            self._state = {name: value.clone() for name, value in state.items()}  # it may be changed in place
+            self._state = {name: value.clone() for name, value in state.items()}  # the batch may change in place
         return self.method.synthesize(batch, self.method.features(batch, self._transported))

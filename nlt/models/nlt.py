@@ -1,4 +1,4 @@
-"""The paper's method: light transport on points, optionally with photons, projected and synthesized."""
+"""The paper's method: light transport on points and optionally photons, projection and image synthesis."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PHOTON_ATTRIBUTES = 3 + 3 + 3  # origin, direction, colour
 
 
 class NeuralLightTransport(RenderingModule):
-    """Sec. "Method": G-buffer and projected point features, with `photons` also projected photon features."""
+    """Sec. "Method": the U-Net sees the G-buffer, projected point features and, with `photons`, photon features."""
 
     architecture = (
         *RenderingModule.architecture, "num_scenes", "num_points", "points", "photons", "embedding",
@@ -26,7 +26,7 @@ class NeuralLightTransport(RenderingModule):
     )  # fmt: skip
 
     def __init__(self, points: bool = True, photons: bool = False, embedding: int = 32, **kwargs: Any) -> None:
-        """The base class takes the keyword arguments.
+        """The keyword arguments are those of the base class.
 
         Args:
             points: use the points; without them there is no PointNet and no embedding.
@@ -58,13 +58,13 @@ class NeuralLightTransport(RenderingModule):
         return ("gbuffer", "photons") if self.hparams["photons"] else ("gbuffer",)
 
     def transport(self, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
-        """Features of the points (B, N, point_width) and of the photons (B, P, photon_width), None if not used.
+        """Return features of the points (B, N, point_width) and photons (B, P, photon_width), None if not used.
 
-        In training, `features` computes those of the photons, for it knows which of them the view sees.
+        In training, `features` computes the photons' features, because it knows which photons the view sees.
         """
         points = self._point_features(batch) if self.hparams["points"] else None
-        now = self.hparams["photons"] and not self.training
-        return points, self.photon_network(self._photons(batch)) if now else None
+        all_photons = self.hparams["photons"] and not (self.training and torch.is_grad_enabled())
+        return points, self.photon_network(self._photons(batch)) if all_photons else None
 
     def _point_features(self, batch: Batch) -> Tensor:
         exposure, visible = batch["exposure"], batch["point_visible"]
@@ -79,8 +79,8 @@ class NeuralLightTransport(RenderingModule):
         return self.pointnet(torch.cat([x.to(points[0].dtype) for x in points], dim=-1), visible)
 
     def _photons(self, batch: Batch) -> Tensor:
-        """The photon network's input (B, P, 9)."""
-        # Times their number: a photon carries that share of the power that arrives.
+        """Return the photon network's input (B, P, 9)."""
+        # Times their number: each photon carries only its share of the arriving power.
         power = batch["photon_flux"] * batch["photon_valid"].sum(1).view(-1, 1, 1)
         colour = log_exposed(power, batch["exposure"])
         return torch.cat([batch["photon_origin"], batch["photon_direction"], colour], dim=-1)
@@ -95,11 +95,11 @@ class NeuralLightTransport(RenderingModule):
         maps = self.gbuffer_and(batch, clouds)
         if not self.hparams["photons"] or photons is not None:
             return maps
-        assert isinstance(maps, Tensor)  # sparse maps are for inference
+        assert isinstance(maps, Tensor)  # maps are sparse only without gradients
         return join([maps, self._seen_photons(batch)])
 
     def _seen_photons(self, batch: Batch) -> Tensor:
-        """The map (B, photon_width, H, W) of the photons, whose features are computed where the view sees them."""
+        """Return the photons' map (B, photon_width, H, W), computing features only for photons that the view sees."""
         images, _, height, width = batch["depth"].shape
         view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
         pixels = visible_pixels(batch["photon_hit"], batch["photon_valid"], **view)

@@ -1,7 +1,7 @@
-"""The plain reference path: a method's own weights by the straightforward reading of the paper, to measure speed-ups.
+"""The plain path: a method with its own weights in a straightforward implementation, to measure speed-ups against.
 
-Eager, float32 throughout, contiguous NCHW, one pass over everything, nothing kept from frame to frame. Slow on purpose:
-whatever makes the usual path fast does not belong here.
+Eager, float32 throughout, contiguous NCHW, a single pass, nothing cached between frames. It is slow on purpose:
+optimizations of the usual path do not belong here.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from nlt.models.unet import UNet
 
 
 def plain(method: RenderingModule) -> RenderingModule:
-    """A copy of a method that makes the same image, up to rounding, by the plain path."""
+    """Return a copy of a method that computes the same image, up to rounding, by the plain path."""
     twin = copy.deepcopy(method).float().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     twin.__class__ = type(f"Plain{type(method).__name__}", (_Plain, type(method)), {})
     return twin
 
 
 class _Plain(RenderingModule):
-    """What a plain method does in place of its own."""
+    """The methods that a plain copy overrides."""
 
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
         camera = (batch["camera_matrix"], batch["world_to_view"])
@@ -52,7 +52,7 @@ def _in_float32(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], Any
 
 @contextmanager
 def _float32(device: torch.device) -> Iterator[None]:
-    """No fast path of the policy's, no TF32."""
+    """Disable the policy's fast paths and TF32."""
     precision = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
@@ -63,7 +63,7 @@ def _float32(device: torch.device) -> Iterator[None]:
 
 
 def _unet(net: UNet, x: Tensor) -> Tensor:
-    """The supplementary's figure, block by block: (B, C, H, W) to (B, 3 or 6, H, W)."""
+    """Run the U-Net as in the supplementary's figure, block by block: (B, C, H, W) to (B, 3 or 6, H, W)."""
     levels = [_block(net.down[0], net.conv_in(x))]
     for block in net.down[1:]:
         levels.append(_block(block, F.max_pool2d(levels[-1], 2, ceil_mode=True)))
@@ -89,7 +89,7 @@ def project(
     normal: Tensor,
     epsilon: float = 1e-3,
 ) -> Tensor:
-    """Eq. (1), every point in full: arguments and result as of `nlt.models.projection.project`."""
+    """Project features by Eq. (1), with the arguments and the result of `nlt.models.projection.project`."""
     height, width = depth.shape[-2:]
     rotation, translation = world_to_view[:, :3, :3], world_to_view[:, None, :3, 3]
     view = positions @ rotation.mT + translation
@@ -100,9 +100,9 @@ def project(
     seen = valid & in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y = torch.where(seen, x, 0), torch.where(seen, y, 0)
 
-    # How much of the four nearest pixels, by bilinear weight, shows a surface whose plane lies before the point.
+    # The bilinear weight of those of the four nearest pixels whose plane lies in front of the point.
     to_ray = torch.linalg.inv(camera_matrix).mT
-    ray = torch.stack([x, y, torch.ones_like(x)], -1) @ to_ray  # of depth 1
+    ray = torch.stack([x, y, torch.ones_like(x)], -1) @ to_ray  # at depth 1
     occluded = torch.zeros_like(x)
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
     for column, row in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
@@ -112,8 +112,8 @@ def project(
         at = (row * width + column).long()
         surface = _gather(depth, at)
         n = _gather(normal.to(depth.dtype), at) @ rotation.mT
-        met = (n * centre * surface).sum(-1) / (n * ray).sum(-1)  # depth of the plane on the point's ray
-        occluded += weight * ((surface[..., 0] > 0) & (met > 0) & (z > (1 + epsilon) * met))
+        plane_depth = (n * centre * surface).sum(-1) / (n * ray).sum(-1)  # along the point's ray
+        occluded += weight * ((surface[..., 0] > 0) & (plane_depth > 0) & (z > (1 + epsilon) * plane_depth))
     seen = seen & (occluded < 0.5)
 
     pixel = (y.long() * width + x.long())[:, None]
@@ -125,5 +125,5 @@ def project(
 
 
 def _gather(image: Tensor, pixels: Tensor) -> Tensor:
-    """Of an image (B, C, H, W) at flat pixels (B, N): (B, N, C)."""
+    """Return the values (B, N, C) of an image (B, C, H, W) at flat pixel indices (B, N)."""
     return image.flatten(2).gather(2, pixels[:, None].expand(-1, image.shape[1], -1)).mT

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class SparseMap(NamedTuple):
-    """A feature map (B, C, H, W) that is zero but where `rows` (M, C) are added up at their `pixels`.
+    """A feature map (B, C, H, W) that is zero except at `pixels`, where the `rows` (M, C) are added up.
 
     `pixels` (M,) int64: (image * H + row) * W + column.
     """
@@ -19,7 +19,7 @@ class SparseMap(NamedTuple):
 
 
 def _transform(matrix: Tensor, vectors: Tensor) -> Tensor:
-    """Matrices (B, 3, 3) times vectors (B, 3, N)."""
+    """Multiply vectors (B, 3, N) by matrices (B, 3, 3)."""
     # Not a matmul: that may run in bfloat16 or TF32, which moves points by whole pixels.
     x, y, z = (matrix[:, :, k, None] * vectors[:, None, k] for k in range(3))
     return x + y + z
@@ -34,18 +34,25 @@ def visible_pixels(
     normal: Tensor,
     epsilon: float = 1e-3,
 ) -> Tensor:
-    """The pixel each point is seen in.
+    """Return the pixel in which each point is visible.
 
-    `positions` (B, N, 3) in metres, world; `valid` (B, N) bool; `camera_matrix` (B, 3, 3) in pixels;
-    `world_to_view` (B, 4, 4); `depth` (B, 1, H, W) in metres along z, 0 where nothing was hit; `normal`
-    (B, 3, H, W), world.
+    Args:
+        positions: (B, N, 3) in metres, world space.
+        valid: (B, N) bool.
+        camera_matrix: (B, 3, 3) in pixels.
+        world_to_view: (B, 4, 4).
+        depth: (B, 1, H, W) in metres along z, 0 where no surface is hit.
+        normal: (B, 3, H, W), world space.
+        epsilon: the paper's tolerance of the depth.
 
-    Returns (B, N) int64: row * W + column of floor(K T p), or H * W for a point that is not valid, not in
-    front of the camera, outside the image, or occluded. A pixel occludes what lies behind the plane through
-    the surface at its centre: at more than 1 + epsilon times the plane's depth there, the paper's tolerance.
-    A point is occluded where at least half of the four nearest pixels, weighted bilinearly, occlude it.
-    Planes, for depths alone would drop most points of a slanted surface; a vote, for between two pixels that
-    see different surfaces no depth in between is either's.
+    Returns:
+        (B, N) int64: row * W + column of floor(K T p), or H * W for a point that is not valid, not in front of the
+        camera, outside the image, or occluded.
+
+    A pixel occludes points behind the plane through the surface at its centre: at more than 1 + epsilon times the
+    plane's depth on the point's ray. A point is occluded if at least half of the four nearest pixels, weighted
+    bilinearly, occlude it. Depths without planes would drop most points of a slanted surface. The pixels vote because
+    a depth interpolated between pixels of different surfaces belongs to neither.
     """
     height, width = depth.shape[-2:]
     view = _transform(world_to_view[:, :3, :3], positions.mT) + world_to_view[:, :3, 3:]
@@ -57,8 +64,8 @@ def visible_pixels(
 
     # The plane of a pixel is n . (v - x) = 0 in view space, where v = K^-1 (K T p) and x = depth K^-1 centre.
     to_pixels = _transform(torch.linalg.inv_ex(camera_matrix)[0].mT, world_to_view[:, :3, :3])
-    few = 4 * x.shape[1] < height * width  # then only the planes that are looked at
-    if not few:
+    few_points = 4 * x.shape[1] < height * width  # then only their planes are computed
+    if not few_points:
         column, row = (torch.arange(size, device=depth.device) for size in (width, height))
         everywhere = (column.repeat(height), row.repeat_interleave(width))
         planes = _tangent_planes(to_pixels, depth.flatten(2), normal.flatten(2), *everywhere).mT.flatten(0, 1)
@@ -69,7 +76,7 @@ def visible_pixels(
         weight = (1 - (x - 0.5 - i).abs()) * (1 - (y - 0.5 - j).abs())
         column, row = i.long().clamp(0, width - 1), j.long().clamp(0, height - 1)
         at = row * width + column
-        if few:
+        if few_points:
             plane = _tangent_planes(to_pixels, _at(depth, at), _at(normal, at), column, row)
         else:
             plane = planes[first + at].mT
@@ -79,21 +86,21 @@ def visible_pixels(
 
 
 def _at(image: Tensor, pixels: Tensor) -> Tensor:
-    """Of an image (B, C, H, W) its pixels (B, K), row * W + column: (B, C, K)."""
+    """Return the values (B, C, K) of an image (B, C, H, W) at pixels (B, K), row * W + column."""
     return image.flatten(2).gather(2, pixels[:, None].expand(-1, image.shape[1], -1))
 
 
 def _tangent_planes(to_pixels: Tensor, depth: Tensor, normal: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """(B, 3, K): w of each of K pixels, such that w . K T p is p's depth over that of the pixel's plane on p's ray."""
+    """Return w (B, 3, K) of K pixels: w . K T p is p's depth over that of the pixel's plane along p's ray."""
     m = _transform(to_pixels, normal.to(depth.dtype))
     along = m[:, 0] * (column + 0.5) + m[:, 1] * (row + 0.5) + m[:, 2]
-    return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit: infinitely far
+    return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit is infinitely far
 
 
 def total(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """Sum of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W)."""
+    """Return the sum (B, C, H, W) of features (B, N, C) in each pixel; `pixels` (B, N) as from `visible_pixels`."""
     batch, _, channels = features.shape
-    rows = height * width + 1  # the last collects the points that are dropped
+    rows = height * width + 1  # the last one collects the points that are not visible
     # bfloat16 would stop counting at 256
     features = features.to(torch.promote_types(features.dtype, torch.float32))
     index = (pixels + rows * torch.arange(batch, device=pixels.device)[:, None]).flatten()
@@ -103,13 +110,16 @@ def total(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
 
 
 def average(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """Mean of features (B, N, C) by pixels (B, N), as from `visible_pixels`: (B, C, H, W), 0 where none."""
+    """Return the mean (B, C, H, W) of features (B, N, C) in each pixel, 0 where there is none; see `total`."""
     count = total(torch.ones_like(features[..., :1], dtype=torch.float32), pixels, height, width)
     return total(features, pixels, height, width).div_(count.clamp(min=1))
 
 
 def average_rows(rows: Tensor, pixels: Tensor, batch: int, height: int, width: int) -> Tensor:
-    """Mean of rows (M, C) by pixels (M,), (image * height + row) * width + column: (batch, C, height, width)."""
+    """Return the mean (batch, C, height, width) of rows (M, C) in each pixel.
+
+    `pixels` (M,): (image * height + row) * width + column.
+    """
     rows = rows.to(torch.promote_types(rows.dtype, torch.float32))  # as in `total`
     sums = rows.new_zeros(batch * height * width, rows.shape[1]).index_add_(0, pixels, rows)
     count = torch.bincount(pixels, minlength=len(sums)).clamp(min=1)
@@ -117,7 +127,7 @@ def average_rows(rows: Tensor, pixels: Tensor, batch: int, height: int, width: i
 
 
 def average_sparsely(features: Tensor, pixels: Tensor, height: int, width: int) -> SparseMap:
-    """As `average`: a row for each pixel in which a point is visible."""
+    """Return the same means as `average`, with a row for each pixel in which a point is visible."""
     visible = pixels < height * width
     at = (pixels + height * width * torch.arange(len(pixels), device=pixels.device)[:, None])[visible]
     seen, row, count = at.unique(return_inverse=True, return_counts=True)
@@ -136,7 +146,7 @@ def project(
     normal: Tensor,
     epsilon: float = 1e-3,
 ) -> Tensor:
-    """Eq. (1): features (B, N, C) of points to a feature map (B, C, H, W), differentiable in the features.
+    """Project features (B, N, C) of points to a map (B, C, H, W) by Eq. (1), differentiable in the features.
 
     The other arguments are those of `visible_pixels`.
     """

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class PointEmbedding(nn.Module):
-    """A learned vector for each point of each scene; `num_points` is every scene's number of points N."""
+    """A learned vector for each point of each scene; every scene has `num_points` (N) points."""
 
     def __init__(self, num_scenes: int, num_points: int, channels: int) -> None:
         super().__init__()
@@ -17,15 +17,15 @@ class PointEmbedding(nn.Module):
         nn.init.normal_(self.table.weight, std=0.01)
 
     def forward(self, scene: Tensor) -> Tensor:
-        """Scene indices (B,) -> (B, N, channels)."""
+        """Return the embeddings (B, N, channels) of the scenes with indices (B,)."""
         points = torch.arange(self.num_points, device=scene.device)
         return self.table(scene[:, None] * self.num_points + points)
 
 
 class ResidualBlock(nn.Module):
-    """Pre-activation residual block of two linear layers on the last axis (..., in) -> (..., out).
+    """A pre-activation residual block of two linear layers on the last axis: (..., in) -> (..., out).
 
-    As in Occupancy Networks (Mescheder et al. 2019): the shortcut is linear where the widths differ.
+    As in Occupancy Networks (Mescheder et al. 2019), the shortcut is linear where the widths differ.
     """
 
     def __init__(self, in_features: int, hidden: int, out_features: int) -> None:
@@ -41,9 +41,9 @@ class ResidualBlock(nn.Module):
 
 
 def exactly(layer: nn.Linear, x: Tensor) -> Tensor:
-    """The layer's output in the precision of x; under autocast, rounded only then.
+    """Return the layer's output, computed in the precision of x and, under autocast, rounded afterwards.
 
-    bfloat16 would round a position of 4 to 8 m to 1.6 cm before it is used.
+    bfloat16 would move a position at 4 to 8 m by up to 1.6 cm before it is used.
     """
     device = x.device.type
     with torch.autocast(device, enabled=False):
@@ -52,7 +52,7 @@ def exactly(layer: nn.Linear, x: Tensor) -> Tensor:
 
 
 def masked_max(x: Tensor, mask: Tensor) -> Tensor:
-    """Maximum of x (B, N, C) over the points in mask (B, N) bool: (B, C), zero where the mask is empty."""
+    """Return the maximum (B, C) of x (B, N, C) over the points in mask (B, N) bool, zero where the mask is empty."""
     hide = torch.where(mask, 0.0, -torch.inf).to(x.dtype)
     maximum = (x + hide[..., None]).max(dim=1).values  # not amax, whose gradient reads all of x to find ties
     return torch.where(mask.any(dim=1, keepdim=True), maximum, 0)
@@ -80,8 +80,10 @@ class PointNet(nn.Module):
 
 
 class PhotonNetwork(nn.Sequential):
-    """Sec. "Implementation Details": a fully connected ResNet, each photon for itself: (B, P, in_features) ->
-    (B, P, features)."""
+    """Sec. "Implementation Details": a fully connected ResNet on each photon separately.
+
+    It maps (B, P, in_features) to (B, P, features).
+    """
 
     def __init__(self, in_features: int, features: int = 64, depth: int = 2) -> None:
         super().__init__(

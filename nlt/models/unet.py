@@ -13,7 +13,7 @@ from nlt.models.projection import SparseMap
 
 
 class ConvBlock(nn.Module):
-    """Pre-activation ResNet block of two 3x3 convolutions: (B, in, H, W) -> (B, out, H, W)."""
+    """A pre-activation ResNet block of two 3x3 convolutions: (B, in, H, W) -> (B, out, H, W)."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -31,39 +31,39 @@ class ConvBlock(nn.Module):
 
 
 class UpBlock(ConvBlock):
-    """The block on the upsampled x and, behind it, skip: (B, C, h, w), (B, in - C, H, W) -> (B, out, H, W)."""
+    """The block on the upsampled x joined with skip: (B, C, h, w), (B, in - C, H, W) -> (B, out, H, W)."""
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
         up = lambda y: F.interpolate(y, size=skip.shape[-2:], mode="bilinear", align_corners=False)
-        of_x, of_skip = self.shortcut.get_parameter("weight").split([x.shape[1], skip.shape[1]], dim=1)
-        shortcut = up(F.conv2d(x, of_x)) + F.conv2d(skip, of_skip)  # a 1x1 convolution is cheaper before upsampling
+        x_weight, skip_weight = self.shortcut.get_parameter("weight").split([x.shape[1], skip.shape[1]], dim=1)
+        shortcut = up(F.conv2d(x, x_weight)) + F.conv2d(skip, skip_weight)  # 1x1: cheaper before upsampling
         return self._add_residual(shortcut, F.relu(torch.cat([up(x), skip], dim=1), inplace=True))
 
 
 def sparse_convolution(conv: nn.Conv2d, x: Tensor, sparse: Sequence[SparseMap]) -> Tensor:
-    """A 3x3 convolution, padded by 1, of x (B, C, H, W) and, in further channels, sparse maps of the same images."""
-    of_x, *others = conv.weight.split([x.shape[1], *(rows.shape[1] for rows, _ in sparse)], dim=1)
-    rimmed = F.conv2d(x, of_x, conv.bias, padding=2)  # by one pixel all around, where rows at the border may add
-    rimmed = rimmed.contiguous(memory_format=torch.channels_last)
-    _, channels, height, width = rimmed.shape
+    """Return a 3x3 convolution, padded by 1, of x (B, C, H, W) joined with sparse maps of the same images."""
+    x_weight, *others = conv.weight.split([x.shape[1], *(rows.shape[1] for rows, _ in sparse)], dim=1)
+    padded = F.conv2d(x, x_weight, conv.bias, padding=2)  # one pixel more on each side, to which rows at the border add
+    padded = padded.contiguous(memory_format=torch.channels_last)
+    _, channels, height, width = padded.shape
     neighbours = torch.arange(3, device=x.device)[:, None] * width + torch.arange(3, device=x.device)
     for (rows, pixels), weight in zip(sparse, others, strict=True):
         line, column = pixels // (width - 2), pixels % (width - 2)
-        first = (line + 2 * (line // (height - 2))) * width + column  # of the nine, in the rimmed images
-        # Where the convolution looks one pixel back, a row adds one pixel ahead: hence the flip.
+        first = (line + 2 * (line // (height - 2))) * width + column  # first of nine pixels, in the padded images
+        # The convolution reads from offset -1, so a row adds to offset +1: hence the flip.
         taps = weight.flip(2, 3).permute(1, 2, 3, 0).flatten(1)  # (C, 9 * out)
         added = (rows @ taps).view(-1, channels)
         at = (first[:, None] + neighbours.flatten()).flatten()
-        rimmed.permute(0, 2, 3, 1).view(-1, channels).index_add_(0, at, added)
-    return rimmed[..., 1:-1, 1:-1]
+        padded.permute(0, 2, 3, 1).view(-1, channels).index_add_(0, at, added)
+    return padded[..., 1:-1, 1:-1]
 
 
 class UNet(nn.Module):
     """Supplementary, "Image Synthesis Layer": (B, in_channels, H, W) -> (B, out_channels, H, W), any H, W.
 
     The supplementary's figure reduces the resolution in three steps and the main text names four blocks:
-    `depth` counts the steps. Features start at `width` and double at each. The output is not bounded. The last of
-    the `in_channels` may be given as sparse maps.
+    `depth` counts the steps. The number of features starts at `width` and doubles at each step. The output is not
+    bounded. The last of the `in_channels` may be given as sparse maps.
     """
 
     def __init__(self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3) -> None:
@@ -79,7 +79,7 @@ class UNet(nn.Module):
         skips = []
         for block in self.down[1:]:
             skips.append(x)
-            x = block(F.max_pool2d(x, 2, ceil_mode=True))  # ceil: a side of 1 stays 1
+            x = block(F.max_pool2d(x, 2, ceil_mode=True))  # ceil_mode keeps a side of 1
         for block, skip in zip(self.up, reversed(skips), strict=True):
             x = block(x, skip)
         return self.conv_out(F.relu(x))

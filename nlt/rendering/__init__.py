@@ -1,1 +1,1 @@
-"""Everything that traces a ray."""
+"""Rendering: the Mitsuba variant, integrators, the G-buffer and photons."""

@@ -1,6 +1,6 @@
-"""Everything that traces a ray: path-traced radiance of any pixels, the G-buffer, photons.
+"""Trace rays through a scene: radiance of any set of pixels, the G-buffer, photons.
 
-Everything comes back as numpy arrays in metres, world coordinates and linear, unclamped RGB.
+All results are numpy arrays in metres, world coordinates and linear, unclamped RGB.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from nlt.scenes.pointcloud import diffuse_albedo
 
 log = logging.getLogger(__name__)
 
-# Lanes traced at once: bounds memory (about 1 kB a lane).
+# Lanes traced at once; this bounds memory, at about 1 kB per lane.
 _MAX_LANES = 1 << 20
-_PILOT = 1 << 15  # photons cast per emitter to find out how many arrive
-_MOST_CASTS = 1024  # per photon that is to arrive
-_WALL = 0.005  # metres: what meets a wall's outer side does not cross the room
-_SIDE = 4  # Emission is the mean over a grid of 4 x 4 rays in each pixel.
+_PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
+_MOST_CASTS = 1024  # per requested photon
+_WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
+_SIDE = 4  # Emission is the mean over 4 x 4 rays in each pixel.
 
 
 class Renderer:
     """Traces rays through a scene in its current state (`scene.set_state`).
 
     Args:
-        teacher: "path" or "bdpt", by which radiance is estimated; "scene": the one that scene.yaml names, where
-            Mitsuba's variant can run it. Both have the same expectation.
+        teacher: "path" or "bdpt", the integrator that estimates radiance; "scene" stands for the one in scene.yaml, if
+            the active Mitsuba variant can run it. Both have the same expectation.
 
     Raises:
-        UserError: the variant cannot run `teacher`.
+        UserError: the active variant cannot run `teacher`.
     """
 
     def __init__(self, scene: Scene, teacher: str = "scene") -> None:
         self.scene = scene
         self.teacher = choose_teacher(scene.description.teacher, teacher)
-        # Infinite depth with Russian roulette: a bound on the depth would bias the teacher.
+        # Infinite depth with Russian roulette, because a maximum depth would bias the result.
         self.integrator = mi.load_dict(
             {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
         )
@@ -64,7 +64,7 @@ class Renderer:
             dr.make_opaque(self._room)
 
     def radiance(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray | None = None) -> np.ndarray:
-        """The teacher's radiance; traces the pixels asked for and no others.
+        """Estimate radiance with the integrator; only the requested pixels are traced.
 
         Args:
             pixels: (n,) flat indices, row by row; None for the whole image.
@@ -75,7 +75,7 @@ class Renderer:
         if pixels is not None:
             return self._trace(camera, spp, seed, pixels)
         if not is_jit():
-            # A Python loop per path costs more than C++ per image unless few pixels are asked for.
+            # A Python loop over paths takes longer than a whole image in C++, unless few pixels are requested.
             return self._scalar_image(camera, spp, seed)
         image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
         return image.reshape(3, camera.height, camera.width)
@@ -97,7 +97,7 @@ class Renderer:
             corners = {"corner": ("Point2f", np.repeat(corner, count, axis=0))}
             fixed |= {"integrator": self.integrator, "sampler": sampler}
             values, *splats = launch(self._radiance, corners, **fixed)
-            # Samples of a pixel lie side by side: summing them here is deterministic, an atomic add is not.
+            # Samples of a pixel are contiguous. Summing them here is deterministic; an atomic add is not.
             total += values.reshape(len(pixels), count, 3).sum(1, dtype=np.float64)
             for pixel, value in zip(splats[::2], splats[1::2], strict=True):
                 total += _splatted(pixel, value, camera.width * camera.height)[pixels] / len(pixels)
@@ -110,7 +110,7 @@ class Renderer:
             "type": "perspective",
             "fov": camera.fov,
             "near_clip": 1e-4,
-            # Mitsuba's camera looks along +z as ours, but its x points left and its y up.
+            # Mitsuba's camera looks along +z like ours, but its x points left and its y up.
             "to_world": mi.ScalarTransform4f(view_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
             "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
         })  # fmt: skip
@@ -118,7 +118,7 @@ class Renderer:
         return np.moveaxis(np.array(image)[..., :3], 2, 0).astype(np.float32)
 
     def _camera_values(self, camera: Camera) -> dict[str, Any]:
-        """Opaque, so that a new view runs the kernel that the last one compiled."""
+        """Return the camera as opaque values, so that a new view reuses the compiled kernel."""
         units = self.scene.description.units_per_metre
         right, down, forward = camera.rotation.T
         values = {
@@ -134,17 +134,17 @@ class Renderer:
         return {"scene": self.scene.mi_scene, **values}
 
     def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
-        """What primary rays find; the rays pass through the transparent parts of opacity masks.
+        """Trace primary rays, which pass through the transparent parts of opacity masks.
 
         Returns:
             depth (1, H, W), shading normal (3, H, W) and albedo (3, H, W) at pixel centres; emission (3, H, W), the
-            radiance that the pixel sees directly from lamps and from the environment, the mean over its area.
+            radiance that a pixel sees directly from lamps and from the environment, as the mean over its area.
         """
         fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
         centres = camera.centres().astype(np.float32)
         point, normal, albedo, valid = launch(self._gbuffer, {"position": ("Point2f", centres)}, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
-        # Along the camera's axis, from its centre.
+        # Depth is measured from the camera centre along the optical axis.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
         emission = np.zeros((len(centres), 3), np.float32)
         pixels = np.flatnonzero(self._may_see_light(camera, ~valid))
@@ -157,45 +157,46 @@ class Renderer:
         return {**surfaces, "emission": image(emission)}
 
     def _may_see_light(self, camera: Camera, escapes: np.ndarray) -> np.ndarray:
-        """(H W,) bool: the pixels that may have emission, so that the others need no rays for it.
+        """Return (H W,) bool: the pixels that may have emission. The others need no rays for it.
 
-        A pixel may see a lamp if it covers part of the lamp's bounding box. It is taken to see the environment if a ray
-        through its own centre or that of a neighbour `escapes` (H W,).
+        A pixel may see a lamp if it covers part of the lamp's bounding box. It may see the environment if the ray
+        through its own centre or the centre of a neighbour `escapes` (H W,).
         """
         sees = np.zeros(len(escapes), bool)
         if self.scene.environment is not None:
             sees |= ndimage.maximum_filter(escapes.reshape(camera.height, camera.width), 3).ravel()
-        directions = camera.directions(camera.centres())
-        diagonal = np.hypot(1 / camera.matrix[0, 0], 1 / camera.matrix[1, 1])  # A pixel's, at a depth of 1.
+        directions = camera.view_directions().reshape(3, -1)
+        diagonal = np.hypot(1 / camera.matrix[0, 0], 1 / camera.matrix[1, 1])  # of a pixel, at depth 1
         for lamp in self._lamps:
             corners = np.array([lamp.bbox().min, lamp.bbox().max])
             box = corners / self.scene.description.units_per_metre - camera.position
-            # A ray anywhere in a pixel is at most half a diagonal away from the one through its centre.
+            # Every ray in a pixel is at most half a diagonal away from the ray through the centre.
             margin = diagonal / 2 * np.linalg.norm(np.abs(box).max(0)) + 1e-4
+            planes = (box + np.array([[-margin], [margin]])).astype(np.float32)
             with np.errstate(divide="ignore"):
-                to_planes = (box + np.array([[-margin], [margin]]))[:, None] / directions
-            enter, leave = to_planes.min(0).max(1), to_planes.max(0).min(1)
+                low, high = planes[:, :, None] / directions
+            enter, leave = np.minimum(low, high).max(0), np.maximum(low, high).min(0)
             sees |= (enter <= leave) & (leave > 0)
         return sees
 
     def transmits(self, camera: Camera) -> np.ndarray:
-        """(H, W) bool: the surface at the pixel's centre lets light through, as glass does."""
+        """Return (H, W) bool: whether the surface at the pixel centre transmits light, as glass does."""
         lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
         (transmits,) = launch(self._transmits, lanes, masks=self.scene.masks, **self._camera_values(camera))
         return transmits.reshape(camera.height, camera.width)
 
     def photons(self, count: int, seed: int) -> dict[str, np.ndarray]:
-        """Photons that arrive in the room, from all emitters in proportion to the power that arrives from each.
+        """Cast photons that arrive in the room, from all emitters in proportion to the power that arrives from each.
 
-        A photon arrives if it crosses the description's `room` before it first meets a surface; without a `room`, if
-        it meets a surface. Casting goes on until `count` have arrived, at most 1024 casts for each.
+        A photon arrives if it crosses the description's `room` before it first hits a surface; without a `room`, if it
+        hits a surface. Photons are cast until `count` have arrived, with at most 1024 casts for each.
 
         Returns:
-            photon_origin, photon_direction, photon_flux, photon_hit (count, 3) and photon_valid (count,).
-            Flux sums, in expectation, to the power that arrives. What has not arrived by the bound is zero, not valid.
+            photon_origin, photon_direction, photon_flux, photon_hit (count, 3) and photon_valid (count,). The expected
+            sum of the flux is the arriving power. Photons that did not arrive within the limit are zero and not valid.
         """
         rng = np.random.default_rng(seed)
-        arriving, reach = self._arriving()
+        arriving, reach = self._estimate_arrivals()
         share = arriving / arriving.sum()
         # Systematic resampling: each emitter gets its share of the photons, rounded at random.
         edges = np.floor(np.concatenate([[0], np.cumsum(share)]) * count + rng.random())
@@ -203,7 +204,7 @@ class Renderer:
         parts = []
         for k, number in enumerate(np.diff(edges).astype(int)):
             if number:
-                origin, direction, flux, hit, valid = self._arrivals(k, number, reach[k], rng)
+                origin, direction, flux, hit, valid = self._sample_arrivals(k, number, reach[k], rng)
                 parts.append((origin, direction, flux * (number / (share[k] * count)), hit, valid))
         origin, direction, flux, hit, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
         units = self.scene.description.units_per_metre
@@ -215,40 +216,41 @@ class Renderer:
             "photon_valid": valid,
         }
 
-    def _arriving(self) -> tuple[np.ndarray, np.ndarray]:
-        """Per emitter, estimated: the arriving power, mean over RGB, in scene units; the share of casts that arrive."""
+    def _estimate_arrivals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Estimate, per emitter, the arriving power (mean over RGB, scene units) and the share of casts that arrive."""
         lit = self.scene.lit
         if lit.key not in self._pilots:
             uniform = np.random.default_rng(0).random((_PILOT, 5), np.float32)
             with self.scene.in_state(lit):
                 casts = [self._cast(k, uniform) for k in range(len(self.emitters))]
-            # As if at least one had arrived: an emitter that seems to light nothing still gets its photons, if few.
+            # Assume at least one arrival, so that an emitter that seems to light nothing still gets a few photons.
             reach = np.array([max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts])
             power = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
             self._pilots[lit.key] = np.array(power), reach
         return self._pilots[lit.key]
 
-    def _arrivals(self, emitter: int, number: int, reach: float, rng: np.random.Generator) -> list[np.ndarray]:
-        """Origin, direction, flux, hit (number, 3) and valid (number,) of photons of one emitter that arrive."""
-        found: list[tuple[np.ndarray, ...]] = []
+    def _sample_arrivals(self, emitter: int, number: int, reach: float, rng: np.random.Generator) -> list[np.ndarray]:
+        """Return origin, direction, flux, hit (number, 3) and valid (number,) of arriving photons of one emitter."""
+        batches: list[tuple[np.ndarray, ...]] = []
         missing, cast, most = number, 0, number * _MOST_CASTS
         while missing and cast < most:
             width = min(int(1.1 * missing / reach) + 64, most - cast, _MAX_LANES)
             *columns, arrived = self._cast(emitter, rng.random((width, 5), np.float32))
             rows = np.flatnonzero(arrived)[:missing]
-            found.append(tuple(column[rows] for column in columns))
+            batches.append(tuple(column[rows] for column in columns))
             missing -= len(rows)
             cast += width if missing else int(rows[-1]) + 1
-        # Inverse binomial sampling. Stopping at the n-th arrival, after N casts, n / N would be too large on average;
-        # (n - 1) / (N - 1) is unbiased (Haldane 1945), and m / N is where the bound came first (Girshick et al. 1946).
+        # Inverse binomial sampling: if casting stops at the n-th arrival after N casts, n / N is too large on average,
+        # and (n - 1) / (N - 1) is unbiased (Haldane 1945). If it stops at the limit of N casts with m arrivals, m / N
+        # is unbiased (Girshick et al. 1946).
         arrivals = number - missing
         share = arrivals / cast if missing or cast == 1 else (arrivals - 1) / (cast - 1)
-        origin, direction, flux, hit = (np.concatenate(column) for column in zip(*found, strict=True))
+        origin, direction, flux, hit = (np.concatenate(column) for column in zip(*batches, strict=True))
         columns = [origin, direction, flux * (share / max(arrivals, 1)), hit, np.ones(arrivals, bool)]
         return [np.concatenate([c, np.zeros((missing, *c.shape[1:]), c.dtype)]) for c in columns]
 
     def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
-        """In scene units, of an emitter's photons: origin, direction, flux, hit (n, 3); whether they arrive (n,)."""
+        """Cast photons of an emitter: origin, direction, flux, hit (n, 3) in scene units; whether they arrive (n,)."""
         lanes = {
             "u0": ("Float", uniform[:, 0]),
             "u1": ("Point2f", uniform[:, 1:3]),
@@ -263,7 +265,7 @@ def _ray(corner: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:
 
 
 def _radiance(scene: Any, integrator: Any, sampler: Any, corner: Any, **camera: Any) -> tuple:
-    # Box filter: uniform in the pixel.
+    # box filter: uniform in the pixel
     ray = mi.RayDifferential3f(_ray(corner + sampler.next_2d(), **camera))
     value, valid, _ = integrator.sample(scene, sampler, ray)
     return (mi.Color3f(dr.select(valid, value, 0)),)
@@ -279,7 +281,7 @@ def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image
 
 
 def _splatted(pixel: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
-    """(count, 3) float64: sums of `value` (n, 3) by `pixel` (n,), in the order of the lanes."""
+    """Sum `value` (n, 3) by `pixel` (n,) to (count, 3) float64, in the order of the lanes."""
     lit = value.any(1)
     return np.stack([np.bincount(pixel[lit], channel, count) for channel in value[lit].T], 1)
 
@@ -295,10 +297,10 @@ def _emission(scene: Any, masks: bool, corner: Any, **camera: Any) -> tuple:
     def step(k: Any, total: Any) -> tuple:
         place = (mi.Point2f(mi.Float(k % _SIDE), mi.Float(k // _SIDE)) + 0.5) / _SIDE
         interaction = first_surface(scene, _ray(corner + place, **camera), masks)
-        emitter = interaction.emitter(scene)  # The environment's, where the ray escapes.
+        emitter = interaction.emitter(scene)  # the environment if the ray escapes
         return k + 1, total if emitter is None else total + mi.Color3f(emitter.eval(interaction))
 
-    # An unrolled loop compiles for a minute in a large scene, and runs no faster.
+    # An unrolled loop takes a minute to compile in a large scene and runs no faster.
     _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: k < _SIDE**2, step)
     return (total / _SIDE**2,)
 
@@ -309,7 +311,7 @@ def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
     if not _any(valid):
         return (False,)
     bsdf, null = interaction.bsdf(), int(mi.BSDFFlags.Null)
-    # A mask has the flag only for its transparent parts, which rays have passed.
+    # A mask has the Null flag only for its transparent parts, through which the rays have passed.
     flags = dr.select(is_mask(bsdf), bsdf.flags() ^ null, bsdf.flags())
     return (valid & mi.has_flag(flags, mi.BSDFFlags.Transmission),)
 
@@ -324,28 +326,28 @@ def _photons(scene: Any, masks: bool, emitter: Any, low: Any, high: Any, u0: Any
 
 
 def choose_teacher(own: str, wanted: str = "scene") -> str:
-    """The integrator of a scene whose description names `own`: "path" or "bdpt".
+    """Return the integrator, "path" or "bdpt", for a scene whose description names `own`.
 
     Args:
-        wanted: one of these; "scene": `own`, and `path` in its place where Mitsuba's variant cannot run it.
+        wanted: "path", "bdpt" or "scene"; "scene" means `own`, or "path" if the active variant cannot run `own`.
 
     Raises:
-        UserError: the variant cannot run the one that is wanted.
+        UserError: `wanted` is "bdpt" and the active variant cannot run it.
     """
     teacher = own if wanted == "scene" else wanted
     if teacher == "path":
         return teacher
     if is_jit():
-        # Only now, for its classes are those of the variant.
+        # Imported here because its classes belong to the active variant.
         import nlt.rendering.bdpt  # noqa: F401
 
         return teacher
     if wanted != "scene":
-        raise UserError("teacher: bdpt needs Mitsuba's llvm or cuda; install LLVM, or use teacher: path")
-    log.warning("teacher: bdpt needs Mitsuba's llvm or cuda; using path, which has the same expectation")
+        raise UserError("teacher: bdpt needs Mitsuba's llvm or cuda variant; install LLVM, or use teacher: path")
+    log.warning("teacher: bdpt needs Mitsuba's llvm or cuda variant; using path, which has the same expectation")
     return "path"
 
 
 def _any(valid: Any) -> bool:
-    """Scalar rays that miss have no BSDF to ask; arrays mask it themselves."""
+    """Return whether any ray hit. A scalar ray that misses has no BSDF; arrays mask misses themselves."""
     return True if is_jit() else bool(valid)

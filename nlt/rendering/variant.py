@@ -1,4 +1,4 @@
-"""Which Mitsuba variant renders: cuda, else llvm, else scalar, each tried once in a process of its own."""
+"""Choose the Mitsuba variant: cuda, else llvm, else scalar. Each is tried once, in a separate process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LIBRARY = "DRJIT_LIBLLVM_PATH"
 
 @dataclass(frozen=True)
 class Variant:
-    """The variant chosen, and why in one line."""
+    """The chosen variant, with the reason in one line."""
 
     name: str
     reason: str
@@ -33,11 +33,11 @@ class Variant:
 
 @functools.cache
 def use_variant() -> Variant:
-    """Choose, activate and log a Mitsuba variant; `NLT_VARIANT` names one to use without probing."""
+    """Choose, activate and log a Mitsuba variant. `NLT_VARIANT` names a variant to use without probing."""
     variant = choose_variant()
     mi.set_variant(variant.name)
-    dr.set_thread_count(max(2, dr.thread_count()))  # with one, on one core, loading some scenes waits for ever
-    # Quiet about what we handle ourselves; errors still come as exceptions.
+    dr.set_thread_count(max(2, dr.thread_count()))  # with one thread on one core, loading some scenes hangs
+    # Mitsuba's warnings concern cases that nlt handles itself; errors still raise exceptions.
     mi.set_log_level(mi.LogLevel.Error)
     log.info("Mitsuba variant %s: %s", variant.name, variant.reason)
     return variant
@@ -45,7 +45,11 @@ def use_variant() -> Variant:
 
 @functools.cache
 def choose_variant() -> Variant:
-    """The first variant that works. A wrong LLVM aborts the process that loads it, so subprocesses try."""
+    """Return the first variant that works. Subprocesses try, because a wrong LLVM aborts the process that loads it.
+
+    Raises:
+        UserError: `NLT_VARIANT` names no variant.
+    """
     if "NLT_VARIANT" in os.environ:
         name = os.environ["NLT_VARIANT"]
         if name not in VARIANTS:
@@ -59,30 +63,30 @@ def choose_variant() -> Variant:
             if _works(name, library):
                 if library:
                     os.environ[_LIBRARY] = library
-                why = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
-                return _chosen(name, why)
+                reason = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
+                return _chosen(name, reason)
         failed.append(f"{name} does not work here")
     return _chosen(VARIANTS[-1], "; ".join(failed))
 
 
 def _chosen(name: str, reason: str) -> Variant:
-    # Worker processes inherit the choice and do not probe again.
+    # Worker processes inherit this choice and do not probe again.
     os.environ["NLT_VARIANT"] = name
     return Variant(name, reason)
 
 
 def _llvm_libraries() -> list[str | None]:
-    """Candidates, the newest first; None is Dr.Jit's own search."""
+    """Return candidate libraries, the newest first; None stands for Dr.Jit's own search."""
     if _LIBRARY in os.environ:
         return [None]
-    found = {
+    candidates = {
         path
         for pattern in ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*",
                         "/opt/homebrew/opt/llvm/lib/libLLVM*.dylib")
         for path in glob.glob(pattern)
     }  # fmt: skip
     version = lambda path: max((int(d) for d in _digits(os.path.basename(path)) + _digits(path)), default=0)
-    newest = {version(path): path for path in sorted(found)}
+    newest = {version(path): path for path in sorted(candidates)}
     paths: list[str | None] = [newest[v] for v in sorted(newest, reverse=True) if v >= 16]
     return paths or ([None] if ctypes.util.find_library("LLVM") else [])
 
@@ -95,7 +99,7 @@ def _works(variant: str, library: str | None) -> bool:
     environment = dict(os.environ, **({_LIBRARY: library} if library else {}))
     probe = [sys.executable, "-c", _PROBE.format(variant)]
     try:
-        done = subprocess.run(probe, env=environment, capture_output=True, timeout=60, check=False)
+        result = subprocess.run(probe, env=environment, capture_output=True, timeout=60, check=False)
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0
+    return result.returncode == 0

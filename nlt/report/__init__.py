@@ -1,1 +1,1 @@
-"""Tables, figures, report.html and dashboard, from stored results alone."""
+"""Tables, figures, report.html and dashboard, made from stored results alone."""

@@ -1,7 +1,7 @@
-"""`nlt dashboard DIR`: a comparison in TensorBoard, a run per method and seed.
+"""`nlt dashboard DIR`: a comparison in TensorBoard, with a run per method and seed.
 
-The log directory DIR/tensorboard is made anew from the results; curves and image grids are links to what the
-trainings logged, where these still are. No histograms are logged.
+The log directory DIR/tensorboard is rebuilt from the results; curves and image grids are links to the trainings' own
+logs, where these still exist. No histograms are logged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from tensorboard import program
-from tensorboard.plugins.hparams import summary_v2 as hp  # api imports TensorFlow
+from tensorboard.plugins.hparams import summary_v2 as hp  # hparams.api would import TensorFlow
 from torch.utils.tensorboard import SummaryWriter
 
 from nlt.errors import UserError
@@ -25,7 +25,7 @@ from nlt.evaluation.results import OK, Results, load
 from nlt.metrics.quantities import METRICS, heading
 
 LOGS = "tensorboard"
-# What beside method and seed is a hyperparameter: its name, and where it stands in a method's config.
+# The hyperparameters besides method and seed: name, and keys in a method's config.
 _HPARAMS = {
     "width": ("model", "init_args", "width"),
     "loss": ("model", "init_args", "loss"),
@@ -34,7 +34,7 @@ _HPARAMS = {
     "steps": ("trainer", "max_steps"),
     "training images": ("data", "dataset", "train"),
 }
-# Title -> tags; every chart shows all methods.
+# The charts, each for all methods: title -> tags.
 _CURVES = {
     "Loss against noisy images": {"training": ["train/loss"], "validation": ["val/loss"]},
     "Validation against the reference": {
@@ -44,17 +44,17 @@ _CURVES = {
 
 
 def write_logs(results: Results) -> Path:
-    """DIR/tensorboard: METHOD/seed_N of each run, and `comparison` with layout, chart and pictures of all."""
+    """Write and return DIR/tensorboard: METHOD/seed_N for each run; `comparison` for the layout and the figures."""
     logs = results.directory / LOGS
     shutil.rmtree(logs, ignore_errors=True)
     with SummaryWriter(str(logs / "comparison")) as writer:
         writer.add_custom_scalars({title: {k: ["Multiline", v] for k, v in c.items()} for title, c in _CURVES.items()})
         writer._get_file_writer().add_summary(_experiment(results))
-        for path in sorted(results.directory.glob("*.png")):
+        for path in sorted(p for p in results.directory.iterdir() if p.suffix in (".png", ".webp")):
             writer.add_image(path.stem, np.asarray(Image.open(path).convert("RGB")), dataformats="HWC")
     for run in results.runs:
-        place = logs / run["method"] / f"seed_{run['seed']}"
-        with SummaryWriter(str(place)) as writer:
+        run_logs = logs / run["method"] / f"seed_{run['seed']}"
+        with SummaryWriter(str(run_logs)) as writer:
             given = _hparams(results, run)
             writer._get_file_writer().add_summary(hp.hparams_pb(given, trial_id=f"{run['method']}, seed {run['seed']}"))
             for key in (*COLUMNS, *METRICS):
@@ -64,12 +64,12 @@ def write_logs(results: Results) -> Path:
                 writer.add_text("status", f"{run['status']}: {run['message']}")
         training = Path(str(run.get("run")))
         for events in sorted(training.glob("events.out.tfevents.*")) if training.is_dir() else ():
-            (place / events.name).symlink_to(events.resolve())
+            (run_logs / events.name).symlink_to(events.resolve())
     return logs
 
 
 def _experiment(results: Results) -> Any:
-    """The hyperparameters' and final metrics' names, once for all runs."""
+    """Return the names of hyperparameters and final metrics, declared once for all runs."""
     measured = [
         key for key in dict.fromkeys((*COLUMNS, *METRICS)) if any(len(results.values(m, key)) for m in results.methods)
     ]
@@ -80,30 +80,30 @@ def _experiment(results: Results) -> Any:
 
 
 def _hparams(results: Results, run: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {"method": label(run["method"]), "seed": run["seed"]}
-    for name, keys in _HPARAMS.items() if isinstance(run.get("run"), str) else ():  # else it was not trained
+    hparams: dict[str, Any] = {"method": label(run["method"]), "seed": run["seed"]}
+    for name, keys in _HPARAMS.items() if isinstance(run.get("run"), str) else ():  # an untrained method has none
         value: Any = results.manifest.get("configs", {}).get(run["method"], {})
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         if value is not None:
-            found[name] = value
-    return found
+            hparams[name] = value
+    return hparams
 
 
 def dashboard(directory: str, port: int) -> None:
-    """Show a comparison's results in TensorBoard until interrupted; prints its address.
+    """Show a comparison's results in TensorBoard until interrupted; print the address.
 
     Raises:
-        UserError: there are no results, or the port is taken.
+        UserError: there are no results, or the port is in use.
     """
     logs = write_logs(load(directory))
     board = program.TensorBoard()
     board.configure(logdir=str(logs), port=port, reload_interval=30)
     try:
         url = board.launch()
-    except (program.TensorBoardServerException, OverflowError) as error:  # above 65535
+    except (program.TensorBoardServerException, OverflowError) as error:  # OverflowError: above 65535
         raise UserError(f"--port {port}: {' '.join(str(error).split())}; give another one") from None
-    print(f"{url} shows {directory}; Ctrl+C ends it", flush=True)
+    print(f"{url} shows {directory}; press Ctrl+C to stop", flush=True)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

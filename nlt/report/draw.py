@@ -1,4 +1,4 @@
-"""`nlt report DIR`: draws tables, figures and report.html from stored results; the same results give the same bytes."""
+"""`nlt report DIR`: tables, figures and report.html from stored results; the same results give the same bytes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def draw(
     """Write the tables, figures and report.html of the results in a directory.
 
     Args:
-        megabytes: the largest that report.html may be.
-        sections: functions that add a feature's section to report.html, given the directory.
+        megabytes: the maximum size of report.html.
+        sections: functions that return a feature's section of report.html for a directory, or None.
 
     Raises:
-        UserError: the directory has no results.
+        UserError: the directory has no results, or they cannot be read.
     """
     results = load(directory)
     write_tables(results)

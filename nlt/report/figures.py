@@ -1,4 +1,4 @@
-"""The comparison's pictures, from results on disk; and that of a sample of a dataset."""
+"""Figures of a comparison, drawn from its stored results, and the figure of a dataset's sample."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ import matplotlib.pyplot as plt
 
 matplotlib.rcParams["svg.hashsalt"] = "nlt"  # the same drawing gives the same bytes
 
-_INCH, _TITLE = 1.1, 0.35  # of an image in a grid, and above it
-_ROWS = 6  # views in samples.png
-# The supplementary's six panels, and two.
+_INCH, _TITLE = 1.1, 0.35  # inches: an image of a grid, and the space above it
+PICTURE = ("webp",)  # the kind of file for a figure made of images; its lossy pixels are a sixth of a PNG's size
+_ROWS = 6  # views in samples.webp
+# The supplementary's six panels and two more.
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
-# Okabe and Ito's colours, which the colour-blind tell apart; markers and dashes for print without colour.
+# Okabe and Ito's colours for colour-blind readers; markers and dashes for print without colour.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 _CURVES = ("0.3", "#8C510A", "#000000")
@@ -38,26 +39,26 @@ HALO = [withStroke(linewidth=1.5, foreground="white")]
 
 
 def draw_samples(results: Results) -> None:
-    """samples.png: a row per view; teaching input, every method, reference; all by the one display transform."""
+    """Draw samples.webp: a row per view, with the noisy training image, every method and the reference as displayed."""
     reference, noisy = results.images("reference"), results.images("noisy")
     if reference is None or noisy is None:
-        return  # images stay on the machine that made them
-    columns = {"Teaching input": noisy["radiance"]}
+        return  # the images are only on the machine that made them
+    columns = {"Training image": noisy["radiance"]}
     for method in results.methods:
-        found = results.images(method)
-        if found is not None and results.runs_of(method):
-            columns[label(method)] = found["radiance"]
+        stored = results.images(method)
+        if stored is not None and results.runs_of(method):
+            columns[label(method)] = stored["radiance"]
     columns["Reference"] = reference["radiance"]
     rows = np.unique(np.linspace(0, len(noisy["radiance"]) - 1, _ROWS).round().astype(int))
     figure, axes = grid(len(rows), list(columns))
     for column, images in enumerate(columns.values()):
         for row, view in enumerate(rows):
             axes[row][column].imshow(shown(images[view], reference["exposure"][view]), interpolation="nearest")
-    save(figure, results.directory, "samples", ("png",))
+    save(figure, results.directory, "samples", PICTURE)
 
 
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
-    """A figure for images side by side, and its axes (rows, columns); columns have titles. `bottom`: inches free."""
+    """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
     size = (_INCH * len(columns), _INCH * rows + _TITLE + bottom)
     figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
     for axis in axes.flat:
@@ -69,25 +70,28 @@ def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figur
 
 
 def save(figure: plt.Figure, directory: Path, name: str, kinds: tuple[str, ...] = ("png", "svg")) -> None:
-    """Into a directory of results; the same figure gives the same bytes."""
-    dpi = 150 if "svg" in kinds else 100  # without lines and letters to keep sharp, small files
+    """Write a figure into a directory of results; the same figure gives the same bytes."""
+    options: dict[str, dict[str, Any]] = {
+        "png": {"dpi": 150, "metadata": {"Software": None}},
+        "svg": {"dpi": 150, "metadata": {"Date": None}},
+        "webp": {"dpi": 100, "pil_kwargs": {"quality": 90, "method": 6}},
+    }
     for kind in kinds:
-        metadata = {"png": {"Software": None}, "svg": {"Date": None}}[kind]
-        figure.savefig(directory / f"{name}.{kind}", dpi=dpi, metadata=metadata)
+        figure.savefig(directory / f"{name}.{kind}", **options[kind])
     plt.close(figure)
 
 
 def shown(radiance: np.ndarray, exposure: float) -> np.ndarray:
-    """Linear radiance (3, H, W) as displayed: (H, W, 3) sRGB in [0, 1]."""
+    """Return linear radiance (3, H, W) as displayed: sRGB in [0, 1], (H, W, 3)."""
     return display(torch.from_numpy(radiance[None].astype(np.float32)), float(exposure))[0].permute(1, 2, 0).numpy()
 
 
 def draw_sample(path: Path, sample: Batch) -> None:
-    """The twelve pictures of the supplementary's figure "Data Sample Components", of a batch of one."""
+    """Draw the twelve pictures of the supplementary's figure "Data Sample Components" from a batch of one."""
     visible, valid = sample["point_visible"][0], sample["photon_valid"][0]
     height, width = sample["depth"].shape[-2:]
     camera = (sample["camera_matrix"], sample["world_to_view"])
-    # Against a depth map of "no hit", nothing is occluded.
+    # A depth map of "no hit" occludes nothing.
     in_view, kept = (
         visible_pixels(sample["point_position"], sample["point_visible"], *camera, depth, sample["normal"])[0]
         for depth in (torch.zeros_like(sample["depth"]), sample["depth"])
@@ -113,7 +117,7 @@ def draw_sample(path: Path, sample: Batch) -> None:
         "(11) photon origins": (sample["photon_origin"][0], colour),
         "(12) photon hits": (hits, colour[valid]),
     }  # fmt: skip
-    figure = plt.figure(figsize=(12, 8), facecolor="0.15")  # dark: emitters show white
+    figure = plt.figure(figsize=(12, 8), facecolor="0.15")  # dark, because emitters are white
     for k, (name, image) in enumerate(images.items(), 1):
         axis = figure.add_subplot(3, 4, k)
         axis.imshow(image.clamp(0, 1).numpy(), interpolation="nearest", cmap="viridis")
@@ -135,15 +139,15 @@ def draw_sample(path: Path, sample: Batch) -> None:
 
 
 def _scatter(pixels: Tensor, colours: Tensor, height: int, width: int) -> Tensor:
-    """Points (N,) at flat pixels, height * width where dropped, as an image of their mean colour."""
+    """Return an image of the points' mean colour, from flat pixel indices (N,); height * width drops a point."""
     return average(colours[None], pixels[None], height, width)[0].permute(1, 2, 0)
 
 
 def draw_speed_accuracy(results: Results) -> None:
-    """speed_accuracy.png and .svg: accuracy over time per frame, a panel per metric; all of them for each device.
+    """Draw speed_accuracy.png and .svg: accuracy over time per frame, a panel per metric and device.
 
-    Methods of one class that path trace are a curve, labelled by their pixels or samples per pixel. Bars are the
-    standard deviation over seeds, with one seed the 95% interval over test views. The grey line is the Pareto front.
+    Methods of one class that path trace form a curve, labelled by their pixels or samples per pixel. Error bars are
+    the standard deviation over seeds or, with one seed, the 95% interval over test views. Grey is the Pareto front.
     """
     seconds = {
         device: {m: time for m in results.methods if math.isfinite(time := on.mean(m, "time_per_frame_s"))}
@@ -155,7 +159,7 @@ def draw_speed_accuracy(results: Results) -> None:
     if not panels:
         return
     columns = math.ceil(len(panels) / 2)
-    heights = [*[6.1] * len(seconds), 0.6]  # inches; the last for the legend
+    heights = [*[6.1] * len(seconds), 0.6]  # inches; the last is for the legend
     figure = plt.figure(figsize=(3.3 * columns, sum(heights)))
     *blocks, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     axes = np.stack([block.subplots(2, columns, squeeze=False).ravel() for block in blocks])
@@ -163,43 +167,43 @@ def draw_speed_accuracy(results: Results) -> None:
         block.suptitle(f"Timed on {device}" if device else "", fontsize=10)
         block.subplots_adjust(0.18 / columns, 0.08, 1 - 0.03 / columns, 0.9, 0.18, 0.38)
         for axis, key, first in zip(row, panels, axes[0], strict=False):
-            at = {m: (1e3 * time, results.mean(m, key)) for m, time in seconds[device].items()}
-            _speed_accuracy(axis, results, key, {m: place for m, place in at.items() if math.isfinite(place[1])})
-            axis.sharex(axes[0][0])  # one scale shows what a device gains
+            points = {m: (1e3 * time, results.mean(m, key)) for m, time in seconds[device].items()}
+            _draw_panel(axis, results, key, {m: point for m, point in points.items() if math.isfinite(point[1])})
+            axis.sharex(axes[0][0])  # one scale shows how much faster a device is
             axis.sharey(first)
         for axis in row[len(panels) :]:
             axis.set_axis_off()
-    every = [time for times in seconds.values() for time in times.values()]
-    subs = (1, 2, 5) if max(every) < 30 * min(every) else (1,)
+    all_times = [time for times in seconds.values() for time in times.values()]
+    subs = (1, 2, 5) if max(all_times) < 30 * min(all_times) else (1,)
     for axis in axes[:, : len(panels)].flat:
         axis.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=subs))
         axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         axis.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
-    named: dict[str, Any] = {}
+    handles: dict[str, Any] = {}
     for axis in axes.flat:
-        named = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True)) | named
-    below.legend(named.values(), named, loc="center", ncols=min(6, len(named)), fontsize=8, frameon=False)
+        handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True)) | handles
+    below.legend(handles.values(), handles, loc="center", ncols=min(6, len(handles)), fontsize=8, frameon=False)
     save(figure, results.directory, "speed_accuracy")
 
 
-def _speed_accuracy(axis: plt.Axes, results: Results, key: str, at: Mapping[str, tuple[float, float]]) -> None:
-    """A panel: the methods at their places, time in ms and metric."""
+def _draw_panel(axis: plt.Axes, results: Results, key: str, xy: Mapping[str, tuple[float, float]]) -> None:
+    """Draw a panel; `xy` has each method's time in ms and its metric."""
     families = curves(results)
     in_curves = {method for members in families.values() for method in members}
-    if front := pareto_front(at, METRICS[key].direction):
+    if front := pareto_front(xy, METRICS[key].direction):
         axis.step(*zip(*front, strict=True), where="post", color="0.8", lw=5, zorder=0, label="Pareto front")
     for k, (name, members) in enumerate(families.items()):
-        found = [m for m in members if m in at]
+        drawn = [m for m in members if m in xy]
         style = {"color": _CURVES[k % len(_CURVES)], "ls": DASHES[k % 4], "marker": "x+."[k % 3]}
-        _plot(axis, results, key, found, at, name, style)
-        for number, m in enumerate(found):
-            part = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
-            axis.annotate(part, at[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
+        _plot(axis, results, key, drawn, xy, name, style)
+        for number, m in enumerate(drawn):
+            annotation = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
+            axis.annotate(annotation, xy[m], (0, -11 if number % 2 else 5), textcoords="offset points", ha="center",
                           fontsize=7, color=style["color"], zorder=4, path_effects=HALO)  # fmt: skip
     for k, m in enumerate(m for m in results.methods if m not in in_curves):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": "", "marker": MARKERS[k % len(MARKERS)]}
         _plot(
-            axis, results, key, [m] if m in at else [], at, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3}
+            axis, results, key, [m] if m in xy else [], xy, label(m), style | {"mec": "white", "mew": 0.6, "zorder": 3}
         )
     axis.set_xscale("log")
     axis.margins(0.09, 0.12)
@@ -214,20 +218,20 @@ def _plot(
     results: Results,
     key: str,
     methods: list[str],
-    at: Mapping[str, tuple[float, float]],
+    xy: Mapping[str, tuple[float, float]],
     name: str,
     style: Mapping[str, Any],
 ) -> None:
-    """Points with their error bars, joined by the style's line."""
+    """Draw points with their error bars, joined by the style's line."""
     if not methods:
         return
-    x, y = np.array([at[m] for m in methods]).T
+    x, y = np.array([xy[m] for m in methods]).T
     bars = np.array([bar(results, m, key, value) for m, value in zip(methods, y, strict=True)]).T
     axis.errorbar(x, y, yerr=bars, ms=6, lw=1.2, elinewidth=0.9, capsize=2, label=name, **style)
 
 
 def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, float]:
-    """How far an error bar reaches below and above the mean: the deviation over seeds, else the 95% interval."""
+    """Return an error bar's lengths below and above the mean: deviation over seeds, else the 95% interval."""
     if math.isfinite(std := results.std(method, key)):
         return std, std
     low, high = results.interval(method, key)
@@ -235,24 +239,24 @@ def bar(results: Results, method: str, key: str, mean: float) -> tuple[float, fl
 
 
 def curves(results: Results) -> dict[str, list[str]]:
-    """Variants of one method, and classes with several methods that path trace: the methods, by what they are called.
+    """Return the methods to join by a curve, by the curve's name, cheapest first.
 
-    The cheapest comes first.
+    A curve joins the variants of one method, or the path-tracing methods of one class.
     """
     families: dict[tuple[str, str], dict[str, tuple[float, float]]] = {}
     variants: dict[str, list[str]] = {}
     for run in results.runs:
         if run["status"] != OK:
             continue
-        name, at, _ = run["method"].partition("@")
-        if at and run["method"] not in variants.setdefault(name, []):
+        name, is_variant, _ = run["method"].partition("@")
+        if is_variant and run["method"] not in variants.setdefault(name, []):
             variants[name].append(run["method"])
-        elif run["spp"] and not at:
-            # The label tells denoising from guided denoising, which are of one class.
+        elif run["spp"] and not is_variant:
+            # Denoising and guided denoising share a class, but not a label.
             family = (run["family"], label(name).rpartition(" (")[0])
             families.setdefault(family, {})[name] = (run["spp"], run["pixel_fraction"])
     time = partial(results.mean, key="time_per_frame_s")
-    curves = {f"{label(name)}, variants": sorted(found, key=time) for name, found in variants.items() if len(found) > 1}
+    curves = {f"{label(name)}, variants": sorted(names, key=time) for name, names in variants.items() if len(names) > 1}
     for members in families.values():
         if len(members) > 1:
             varied = "spp" if len({spp for spp, _ in members.values()}) > 1 else "pixels traced"
@@ -261,11 +265,11 @@ def curves(results: Results) -> dict[str, list[str]]:
     return curves
 
 
-def pareto_front(at: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:
-    """The (time, value) places that no other place is better than in both, by time."""
+def pareto_front(points: Mapping[str, tuple[float, float]], direction: str) -> list[tuple[float, float]]:
+    """Return the Pareto-optimal (time, value) points, in order of time."""
     sign = 1 if direction == "lower" else -1
     front: list[tuple[float, float]] = []
-    for x, y in sorted(at.values(), key=lambda place: (place[0], sign * place[1])):
+    for x, y in sorted(points.values(), key=lambda point: (point[0], sign * point[1])):
         if not front or sign * y < sign * front[-1][1]:
             front.append((x, y))
     return front

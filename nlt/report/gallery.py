@@ -1,4 +1,4 @@
-"""Pictures of what the methods get wrong, from results on disk: insets, error maps, and what is in the worst pixels."""
+"""Figures of the methods' errors, from stored results: insets, error maps, and causes of the worst pixels."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from scipy.ndimage import uniform_filter
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
-from nlt.report.figures import grid, save, shown
+from nlt.report.figures import PICTURE, grid, save, shown
 from nlt.report.tables import Table, write_texts
 
 import matplotlib.pyplot as plt  # isort: skip  after figures.py has chosen the backend
 
 FAILURES = "failures.csv"
-_VIEWS = 3  # in qualitative.png
-_INSET = 4  # a side of the image over a side of the inset
-WORST = 0.1  # of a method's pixels
-# What the supplementary names as hard, in the order in which a pixel is put down to one: colours of Okabe and Ito.
+_VIEWS = 3  # in qualitative.webp
+_INSET = 4  # image side / inset side
+WORST = 0.1  # fraction of a method's pixels
+# The hard cases that the supplementary names, in order of precedence, with colours of Okabe and Ito.
 CAUSES = {
     "mirror": "#0072B2",
     "glass": "#56B4E9",
@@ -35,7 +35,7 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Shown:
-    """The shown views of results as displayed: (V, H, W, 3) each."""
+    """The stored views as displayed, (V, H, W, 3) each."""
 
     results: Results
     reference: np.ndarray
@@ -44,7 +44,7 @@ class Shown:
 
     @classmethod
     def load(cls, results: Results) -> Shown | None:
-        """None where the images are on another machine, or no method has any."""
+        """Load the views; None if the images are on another machine or no method has any."""
         reference = results.images("reference")
         if reference is None:
             return None
@@ -59,27 +59,31 @@ class Shown:
         return cls(results, reference_shown, noisy, images) if images else None
 
     def error(self, method: str) -> np.ndarray:
-        """(V, H, W): root of the mean over RGB of the squared difference, of what is displayed."""
+        """Return the RMS difference over RGB between the displayed images, (V, H, W)."""
         return np.sqrt(np.square(self.methods[method] - self.reference).mean(-1))
 
     @cached_property
     def scale(self) -> float:
-        """The error that is drawn brightest, one for all methods and views."""
+        """The error drawn brightest: the 99th percentile over all methods and views."""
         return float(np.quantile([self.error(m) for m in self.methods], 0.99)) or 1.0
 
     @cached_property
     def causes(self) -> dict[str, np.ndarray]:
-        """For each of `CAUSES` the pixels (V, H, W) that it applies to; several may apply to one."""
+        """The pixels (V, H, W) to which each of `CAUSES` applies; several may apply to a pixel.
+
+        Raises:
+            UserError: the images are from an older version.
+        """
         buffers = self.results.images("gbuffer")
         assert buffers is not None
         if "transmits" not in buffers:
-            raise UserError(f"{self.results.directory}: images of an older version; run nlt compare again")
+            raise UserError(f"{self.results.directory}: its images are from an older version; run nlt compare again")
         buffers = {name: array.astype(np.float32) for name, array in buffers.items()}
         albedo, normal, depth = buffers["albedo"].mean(1), buffers["normal"], buffers["depth"][:, 0]
         hit = depth > 0
         luminance = self.reference.mean(-1)
         near = hit & (depth < 0.5 * np.median(depth[hit])) if hit.any() else hit
-        specular = hit & (albedo == 0) & (luminance < 1)  # a lamp has no albedo either
+        specular = hit & (albedo == 0) & (luminance < 1)  # lamps have no albedo either, but are bright
         glass = buffers["transmits"].astype(bool)
         dark = ~buffers["light_in_view"].astype(bool)
         causes = {
@@ -93,27 +97,27 @@ class Shown:
 
 
 def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Where light changes, by more than a quarter over two pixels, on a surface that does not: (V, H, W)."""
+    """Return (V, H, W) bool: light changes by more than a quarter over two pixels, and the surface does not."""
     light = np.log(uniform_filter(luminance, (0, 3, 3)) + 0.02)
     edges = np.zeros(depth.shape, bool)
     for axis in (1, 2):
-        step = lambda x, axis=axis: np.abs(np.roll(x, -1, axis) - np.roll(x, 1, axis))
-        smooth = (step(albedo) < 0.02) & (step(depth) < 0.1 * depth)
-        smooth &= np.stack([step(normal[:, k]) for k in range(3)]).max(0) < 0.1
+        change = lambda x, axis=axis: np.abs(np.roll(x, -1, axis) - np.roll(x, 1, axis))
+        smooth = (change(albedo) < 0.02) & (change(depth) < 0.1 * depth)
+        smooth &= np.stack([change(normal[:, k]) for k in range(3)]).max(0) < 0.1
         smooth[:, [0, -1]] = smooth[:, :, [0, -1]] = False
-        edges |= smooth & (step(light) > 0.25)
+        edges |= smooth & (change(light) > 0.25)
     return edges
 
 
 def draw_qualitative(images: Shown) -> None:
-    """qualitative.png: per view the images, an inset where the trained methods err most, and their error maps."""
+    """Draw qualitative.webp: each view's images, an inset where trained methods err most, and error maps."""
     trained = [m for m in images.methods if np.isfinite(images.results.mean(m, "train_s"))] or list(images.methods)
     if not trained:
         return
     errors = {m: images.error(m) for m in images.methods}
     size = images.reference.shape[1]
     side = max(size // _INSET, 4)
-    columns = ["Teaching input", *map(label, images.methods), "Reference"]
+    columns = ["Training image", *map(label, images.methods), "Reference"]
     views = np.unique(np.linspace(0, len(images.reference) - 1, _VIEWS).round().astype(int))
     figure, axes = grid(3 * len(views), columns)
     for k, view in enumerate(views):
@@ -131,22 +135,22 @@ def draw_qualitative(images: Shown) -> None:
             drawn = axes[3 * k + 2][column].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
     bar = axes[-1][-1].inset_axes((0.1, 0.1, 0.15, 0.8))
     figure.colorbar(drawn, cax=bar).ax.tick_params(labelsize=5)
-    axes[-1][-1].text(0.65, 0.5, "error, one scale", fontsize=5, rotation=90, va="center", ha="center",
+    axes[-1][-1].text(0.65, 0.5, "error, same scale", fontsize=5, rotation=90, va="center", ha="center",
                       transform=axes[-1][-1].transAxes)  # fmt: skip
-    save(figure, images.results.directory, "qualitative", ("png",))
+    save(figure, images.results.directory, "qualitative", PICTURE)
 
 
 def worst_pixels(images: Shown, method: str) -> np.ndarray:
-    """(V, H, W) bool: the tenth of a method's pixels with the largest error."""
+    """Return (V, H, W) bool: the tenth of a method's pixels with the largest error."""
     error = images.error(method)
     return error > np.quantile(error, 1 - WORST)
 
 
 def draw_failures(images: Shown) -> None:
-    """failures.png, .csv, .md and .tex: each method's worst tenth of the pixels, and what is in them, counted.
+    """Write failures.webp, .csv, .md and .tex: the causes in each method's worst tenth of the pixels, counted.
 
-    The picture shows the view with most of them: prediction, reference, error, and the worst pixels in the colour of
-    the first cause that applies.
+    The figure shows the view with most of these pixels: prediction, reference, error, and the worst pixels in the
+    colour of the first cause that applies.
     """
     rows = []
     figure, axes = grid(4, [label(m) for m in images.methods], bottom=0.3)
@@ -167,15 +171,15 @@ def draw_failures(images: Shown) -> None:
             })  # fmt: skip
     handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in CAUSES.values()]
     figure.legend(handles, CAUSES, loc="lower center", ncols=len(CAUSES), fontsize=7, frameon=False)
-    save(figure, images.results.directory, "failures", ("png",))
+    save(figure, images.results.directory, "failures", PICTURE)
     write_rows(images.results.directory / FAILURES, rows)
-    counted = failures(images.results)
-    assert counted
-    write_texts(images.results, "failures", [counted], f"images/*.npz, {FAILURES}")
+    table = failures(images.results)
+    assert table
+    write_texts(images.results, "failures", [table], f"images/*.npz, {FAILURES}")
 
 
 def failures(results: Results) -> Table | None:
-    """The counts of failures.csv; None where it is not there."""
+    """Return the counts of failures.csv as a table; None if the file is missing."""
     path = results.directory / FAILURES
     if not path.exists():
         return None
@@ -185,14 +189,17 @@ def failures(results: Results) -> Table | None:
     causes = list(next(iter(by_method.values())))
     everywhere = [next(iter(by_method.values()))[cause]["share_of_all"] for cause in causes]
     counts = [
-        [label(method), *(f"{of[cause]['share_of_worst']:.1%} ({of[cause]['pixels']:,})" for cause in causes)]
-        for method, of in by_method.items()
+        [
+            label(method),
+            *(f"{by_cause[cause]['share_of_worst']:.1%} ({by_cause[cause]['pixels']:,})" for cause in causes),
+        ]
+        for method, by_cause in by_method.items()
     ]
     return Table(
-        "What is in the worst pixels",
-        f"Of each method's worst tenth of the pixels in {len(results.manifest['shown'])} test views, the share to "
-        "which a cause applies and the number of pixels; several causes may apply to one. Above what it is in all "
-        "pixels, the cause goes with errors.",
+        "Causes of the worst pixels",
+        f"Each method's worst tenth of the pixels in {len(results.manifest['shown'])} test views: the share to which a "
+        "cause applies, and the number of these pixels. Several causes may apply to a pixel. If the share exceeds that "
+        "of all pixels, the cause is associated with errors.",
         causes,
         [*counts, ["all pixels", *(f"{share:.1%}" for share in everywhere)]],
     )

@@ -1,4 +1,4 @@
-"""report.html: tables, charts and images of a comparison in one file that opens from disk and loads nothing."""
+"""report.html: tables, charts and images of a comparison in one file that opens from disk and loads no others."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from nlt.report.tables import Table, tables
 
 PAGE = "report.html"
 _PARTS = Path(__file__).parent / "page_parts"
-_MEGABYTES = 25  # of the file, at most
-_OTHER = 500_000  # of these, for what describes the images and the methods
+_MEGABYTES = 25  # maximum size of the file
+_OTHER = 500_000  # bytes reserved for the data on images and methods
 _AXES = ("time_per_frame_s", "flops", "parameters", "peak_memory_bytes")
 _RUN = ("seed", "status", "message", "steps", "trained_at_commit", "run")
 _MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not measured": "–"}
@@ -41,14 +41,14 @@ _FILES = (
     *("table.csv", "table.md", "table.tex", "runs.csv", "timings.csv", "views.csv"),
     *("failures.csv", "failures.md", "failures.tex", "claims.md", "claims.json", "manifest.json"),
 )
-_WEBP = 90  # quality of pixel figures, which lie beside the report as they are
+_WEBP = 90  # quality of embedded pixel figures; the originals are in the report's directory
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of report.html that another feature writes; `None` in its place leaves it out.
+    """A section of report.html that another feature provides.
 
-    `paragraphs` are Markdown; `directory` holds the section's figures and `files`; `source` says which files its
+    `paragraphs` are Markdown; `directory` holds the section's figures and `files`; `source` names the files that its
     tables come from.
     """
 
@@ -66,12 +66,12 @@ def write_page(
 ) -> None:
     """Write report.html from the stored results, the verdicts on the claims, and the figures in the same directory.
 
-    Images are as many and as precise as `megabytes` (10^6 bytes; default: 25) of the file leave room for; of one view
-    at least.
+    The number and the precision of the images, of at least one view, are chosen so that the file stays below
+    `megabytes` (10^6 bytes; default: 25). `None` in `sections` is skipped.
     """
     megabytes = megabytes or _MEGABYTES
     manifest = results.manifest
-    title = str(manifest.get("comparison", "Inequality"))
+    title = str(manifest.get("comparison", "Comparison"))
     if manifest["table"]:
         title += f": {paper()[manifest['table']]['title']}"
     parts = {
@@ -99,7 +99,7 @@ def write_page(
     write_bytes(results.directory / PAGE, text.encode())
 
 
-# --- what the script draws from ---
+# --- data of the script ---
 
 
 def _json(data: Any) -> str:
@@ -137,7 +137,7 @@ def _methods(results: Results) -> list[dict[str, Any]]:
 
 
 def _values(results: Results, method: str, keys: Iterable[str]) -> dict[str, list[Any]]:
-    """Mean, ends of its error bar, and text of each quantity that was measured."""
+    """Return the mean, the ends of its error bar and its text for each measured quantity."""
     values = {}
     for key in keys:
         if key in QUANTITIES and math.isfinite(mean := results.mean(method, key)):
@@ -147,33 +147,33 @@ def _values(results: Results, method: str, keys: Iterable[str]) -> dict[str, lis
 
 
 def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
-    """The packed images of each view, and what unpacks and describes them."""
+    """Return the packed images of each view, and the data that the script needs to unpack and label them."""
     stored = {name: results.images(name) for name in ("reference", "noisy", "gbuffer", *results.methods)}
     reference, gbuffer = stored["reference"], stored["gbuffer"]
     if reference is None:
         return [], {"images": [], "views": []}
     exposure = reference["exposure"].astype(np.float32).reshape(-1, 1, 1, 1)
-    listed = [("reference", "Reference"), ("noisy", "Teaching input (1 spp)")]
+    listed = [("reference", "Reference"), ("noisy", "Training image (1 spp)")]
     listed += [(method, label(method)) for method in results.methods if results.runs_of(method)]
     images: dict[str, tuple[str, str, np.ndarray]] = {
-        name: (title, "radiance", found["radiance"] * exposure)
+        name: (title, "radiance", arrays["radiance"] * exposure)
         for name, title in listed
-        if (found := stored[name]) is not None
+        if (arrays := stored[name]) is not None
     }
     if gbuffer is not None:
         images["albedo"] = ("Albedo", "albedo", gbuffer["albedo"])
         images["normal"] = ("Normals", "normal", gbuffer["normal"] / 2 + 0.5)
     views = [np.stack([array[v] for _, _, array in images.values()]) for v in range(len(reference["view"]))]
-    packed, dropped = pack_to_fit(views, size * 3 // 4)  # base64
+    packed, dropped = pack_to_fit(views, size * 3 // 4)  # leaves room for base64
     height, width = views[0].shape[-2:]
-    compared = Shown.load(results)
+    displayed = Shown.load(results)
     return packed, {
         "images": [{"id": name, "label": title, "kind": kind} for name, (title, kind, _) in images.items()],
         "height": height,
         "width": width,
         "dropped": dropped,
         "stored": len(views),
-        "error_scale": float(f"{compared.scale:.3g}") if compared else 1.0,
+        "error_scale": float(f"{displayed.scale:.3g}") if displayed else 1.0,
         "colours": base64.b64encode(
             matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].tobytes()
         ).decode(),
@@ -181,15 +181,15 @@ def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
             {
                 "view": int(view),
                 "exposure": float(reference["exposure"][k]),
-                "metrics": _of_view(results, int(view), list(images)),
+                "metrics": _view_metrics(results, int(view), list(images)),
             }
             for k, view in enumerate(reference["view"][: len(packed)])
         ],
     }
 
 
-def _of_view(results: Results, view: int, names: list[str]) -> dict[str, dict[str, list[Any]]]:
-    """A view's metrics, as numbers and as text, of the seed whose images are shown."""
+def _view_metrics(results: Results, view: int, names: list[str]) -> dict[str, dict[str, list[Any]]]:
+    """Return a view's metrics as numbers and as text, for the seed whose images are shown."""
     seed = results.manifest["seeds"][0]
     rows = {row["method"]: row for row in results.views if row["view"] == view and row["seed"] == seed}
     return {
@@ -203,7 +203,7 @@ def _of_view(results: Results, view: int, names: list[str]) -> dict[str, dict[st
     }
 
 
-# --- what stands in the page without it ---
+# --- parts of the page that need no script ---
 
 
 def _summary(results: Results) -> str:
@@ -217,8 +217,8 @@ def _summary(results: Results) -> str:
         manifest.get("device", ""),
         f"commit {_commit(manifest)}",
     ]
-    unwell = [f"{label(m)}: {results.status(m)}" for m in results.methods if results.status(m) != OK]
-    warning = f'<p class="warning" role="note">{escape("; ".join(unwell))}</p>' if unwell else ""
+    problems = [f"{label(m)}: {results.status(m)}" for m in results.methods if results.status(m) != OK]
+    warning = f'<p class="warning" role="note">{escape("; ".join(problems))}</p>' if problems else ""
     return f"<p>{' · '.join(escape(fact) for fact in facts if fact)}</p>{warning}"
 
 
@@ -229,7 +229,7 @@ def _commit(manifest: Any) -> str:
 
 @dataclass(frozen=True)
 class _Origins:
-    """Where a grid's numbers come from: said of all, of a column, of a row and of a cell; report.js joins them."""
+    """The provenance of a grid's numbers: of the table, each column, row and cell; report.js joins them."""
 
     table: str
     columns: list[str]
@@ -238,8 +238,8 @@ class _Origins:
 
 
 def _grid(name: str, title: str, table: Table, origins: _Origins, best: Collection[tuple[int, int]] = ()) -> str:
-    """A table that sorts and whose cells are reached by keyboard; `best`: (row, column) of those in bold."""
-    origin = lambda said: f' data-origin="{escape(said)}"' if said else ""
+    """Return a sortable table with keyboard navigation as HTML; `best` has the (row, column) of bold cells."""
+    origin = lambda note: f' data-origin="{escape(note)}"' if note else ""
     directions = [QUANTITIES[key].direction for key, _ in table.sources] or ["lower"] * len(table.columns)
     rows = []
     for r, (head, *row) in enumerate(table.rows):
@@ -248,16 +248,16 @@ def _grid(name: str, title: str, table: Table, origins: _Origins, best: Collecti
             f"{escape(cell)}</td>"
             for c, cell in enumerate(row)
         )
-        of_row = origin(origins.rows[r] if origins.rows else "")
-        rows.append(f'<tr data-index="{r}"{of_row}><th scope="row">{escape(head)}</th>{cells}</tr>')
+        row_origin = origin(origins.rows[r] if origins.rows else "")
+        rows.append(f'<tr data-index="{r}"{row_origin}><th scope="row">{escape(head)}</th>{cells}</tr>')
     headings = zip([table.first, *table.columns], ["lower", *directions], ["", *origins.columns], strict=True)
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(title)}">'
         f'<table class="grid" id="{escape(name)}" aria-label="{escape(title)}"{origin(origins.table)}><thead><tr>'
         + "".join(
-            f'<th scope="col" data-direction="{direction}"{origin(said)}>'
+            f'<th scope="col" data-direction="{direction}"{origin(note)}>'
             f'<button type="button">{escape(column)}</button></th>'
-            for column, direction, said in headings
+            for column, direction, note in headings
         )
         + f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
@@ -269,15 +269,15 @@ def _titled(table: Table, grid: str) -> str:
 
 
 def _table(results: Results, table: Table, number: int) -> str:
-    """The best of each metric is bold."""
+    """Return a table of results as HTML, with the best value of each metric in bold."""
     keys = [key for key, _ in table.sources]
     chosen = [(results.best(key), c) for c, key in enumerate(keys) if key in METRICS]
     best = {(results.methods.index(method), c) for method, c in chosen if method is not None}
     origins = _Origins(
-        _measured(results),
-        [_column(results, *source) for source in table.sources],
-        [_trainings(results, method) for method in results.methods],
-        [[_numbers(of, method, key) for key, of in table.sources] for method in results.methods],
+        _measurement(results),
+        [_column_origin(results, *source) for source in table.sources],
+        [_training_lines(results, method) for method in results.methods],
+        [[_exact_values(source, method, key) for key, source in table.sources] for method in results.methods],
     )
     if len(table.rows) > len(results.methods):
         origins.rows.append("manifest.json, floor")
@@ -285,7 +285,7 @@ def _table(results: Results, table: Table, number: int) -> str:
     return _titled(table, _grid(f"table-{number}", table.title, table, origins, best))
 
 
-def _measured(results: Results) -> str:
+def _measurement(results: Results) -> str:
     manifest = results.manifest
     facts = [
         f"N = {manifest['n_test']} test views",
@@ -296,29 +296,29 @@ def _measured(results: Results) -> str:
     return "; ".join(filter(None, facts))
 
 
-def _column(results: Results, key: str, of: Results) -> str:
-    """The file and column that a column's numbers are from."""
-    if of is not results:
-        return f"timings.csv, column {key}, of {of.manifest['device']} at commit {_commit(of.manifest)}"
-    return f"runs.csv, column {key}" + (f"; its interval: views.csv, column {key}" if QUANTITIES[key].per_image else "")
+def _column_origin(results: Results, key: str, source: Results) -> str:
+    """Return the file and the column that a table's column comes from."""
+    if source is not results:
+        return f"timings.csv, column {key}, {source.manifest['device']}, commit {_commit(source.manifest)}"
+    return f"runs.csv, column {key}" + (f"; interval: views.csv, column {key}" if QUANTITIES[key].per_image else "")
 
 
-def _trainings(results: Results, method: str) -> str:
-    """The runs of a method: seed, directory of the training, steps, commit."""
-    found = []
+def _training_lines(results: Results, method: str) -> str:
+    """Return a line for each run of a method: seed, training directory, steps, commit."""
+    lines = []
     for run in results.runs:
         if run["method"] != method:
             continue
         facts = [f"seed {run['seed']}"] + ([f"{run['status']}: {run['message']}"] if run["status"] != OK else [])
-        facts += [f"checkpoint in {run['run']}"] if isinstance(run.get("run"), str) else ["without training"]
+        facts += [f"checkpoint in {run['run']}"] if isinstance(run.get("run"), str) else ["not trained"]
         for name, key in (("steps", "steps"), ("trained at commit", "trained_at_commit")):
             facts += [f"{name} {value[:12]}"] if (value := _plain(run.get(key))) else []
-        found.append(", ".join(facts))
-    return "\n".join(found)
+        lines.append(", ".join(facts))
+    return "\n".join(lines)
 
 
-def _numbers(results: Results, method: str, key: str) -> str:
-    """What was measured, to the digit."""
+def _exact_values(results: Results, method: str, key: str) -> str:
+    """Return the unrounded values of a cell."""
     runs = results.runs_of(method)
     parts = [f"seed {run['seed']}: {run[key]!r}" for run in runs if math.isfinite(run.get(key, math.nan))]
     low, high = results.interval(method, key)
@@ -328,46 +328,49 @@ def _numbers(results: Results, method: str, key: str) -> str:
 
 
 def _failures(results: Results) -> str:
-    """The counts beside the figure."""
+    """Return the table of failures as HTML; empty if there is none."""
     table = failures(results)
     if table is None:
         return ""
     columns = [f"{FAILURES}, share_of_worst and pixels of the cause {cause}" for cause in table.columns]
-    origins = _Origins(f"images/*.npz of seed {results.manifest['seeds'][0]}; {_measured(results)}", columns)
+    origins = _Origins(f"images/*.npz of seed {results.manifest['seeds'][0]}; {_measurement(results)}", columns)
     return _titled(table, _grid("failures", table.title, table, origins))
 
 
 def _section(section: Section) -> str:
-    """A section of another feature as HTML."""
+    """Return another feature's section as HTML."""
     heading = f'<h2 id="{section.name}-title">{escape(section.title)}</h2>'
     parts = [f'<section id="{section.name}" aria-labelledby="{section.name}-title">', heading]
     parts += [f"<p>{_marked_up(text)}</p>" for text in section.paragraphs]
     for number, table in enumerate(section.tables):
         origins = _Origins(section.source, [""] * len(table.columns))
         parts.append(_titled(table, _grid(f"{section.name}-{number}", table.title, table, origins)))
-    files = f'<p class="note">As files: {_files(section.directory, section.files)}.</p>'
+    files = f'<p class="note">Files: {_files(section.directory, section.files)}.</p>'
     return "\n".join([*parts, _figures(section.directory), files, "</section>"])
 
 
 def _marked_up(text: str) -> str:
-    """Markdown's strong text and code as HTML."""
+    """Return Markdown with strong text and code converted to HTML."""
     code = re.sub(r"`(.*?)`", r"<code>\1</code>", escape(text))
     return re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", code)
 
 
 def _figures(directory: Path) -> str:
-    """The pictures beside the results, as vectors where there are both."""
-    found = {path.stem: path for path in sorted(directory.glob("*.[ps][nv]g"))}  # .svg comes after .png
+    """Return the directory's figures as HTML, SVG preferred."""
+    kinds = (".png", ".svg", ".webp")
+    paths = {path.stem: path for path in sorted(directory.glob("*.*")) if path.suffix in kinds}  # .svg after .png
     return "\n".join(
         f'<figure><img alt="{escape(name.replace("_", " "))}" src="{_picture(path)}">'
         f"<figcaption>{escape(name.replace('_', ' ').capitalize())}</figcaption></figure>"
-        for name, path in found.items()
+        for name, path in paths.items()
     )
 
 
 def _picture(path: Path) -> str:
     if path.suffix == ".svg":
         return _url(path.read_bytes(), "image/svg+xml")
+    if path.suffix == ".webp":
+        return _url(path.read_bytes(), "image/webp")
     webp = io.BytesIO()
     Image.open(path).convert("RGB").save(webp, "WEBP", quality=_WEBP)
     return _url(webp.getvalue(), "image/webp")
@@ -378,15 +381,15 @@ def _url(content: bytes, mime: str) -> str:
 
 
 def _files(directory: Path, names: Iterable[str]) -> str:
-    """Links that hold the tables and raw numbers as files."""
-    found = [path for name in names if (path := directory / name).exists()]
+    """Return links with embedded files of tables and raw numbers."""
+    paths = [path for name in names if (path := directory / name).exists()]
     return ", ".join(
-        f'<a download="{path.name}" href="{_url(path.read_bytes(), "text/plain")}">{path.name}</a>' for path in found
+        f'<a download="{path.name}" href="{_url(path.read_bytes(), "text/plain")}">{path.name}</a>' for path in paths
     )
 
 
 def _claims(results: Results, claims: list[Claim]) -> str:
-    """A line per claim, which opens into its comparisons; nothing where the results' table makes none."""
+    """Return a line per claim that opens to its comparisons; empty if the results' table has no claims."""
     if not claims:
         return ""
     verdicts = [claim.verdict for claim in claims]
@@ -399,18 +402,18 @@ def _claims(results: Results, claims: list[Claim]) -> str:
             ["against", "metric", "margin", "verdict"],
             [[label(c.method), label(c.other), heading(c.metric), _margin(c), _verdict(c)] for c in claim.comparisons],
         )
-        origins = _Origins(f"claims.json; computed from runs.csv and views.csv, {_measured(results)}", [""] * 4)
+        origins = _Origins(f"claims.json; computed from runs.csv and views.csv, {_measurement(results)}", [""] * 4)
         lines.append(
             f'<details id="{escape(claim.id)}"><summary><span class="verdict {claim.verdict.replace(" ", "-")}">'
             f"{_MARKS[claim.verdict]} {claim.verdict}</span> {escape(claim.says)}</summary>"
-            f'<p class="note">{escape(claim.where)}. What decides: {escape(claim_text(claim))}.</p>'
+            f'<p class="note">{escape(claim.where)}. Deciding comparison: {escape(claim_text(claim))}.</p>'
             + _grid(f"comparisons-{claim.id}", f"Comparisons of {claim.id}", table, origins)
             + "</details>"
         )
     return (
         '<section id="claims" aria-labelledby="claims-title"><h2 id="claims-title">Claims of the paper</h2>'
-        f'<p class="note">At this scale {count}. A margin is positive where the comparison is as claimed; in brackets '
-        f"its 95% interval over test images and seeds. A line opens.</p>{''.join(lines)}</section>"
+        f'<p class="note">At this scale: {count}. A positive margin supports the claim; in brackets is its 95% '
+        f"interval over test images and seeds. Click on a claim to see its comparisons.</p>{''.join(lines)}</section>"
     )
 
 
@@ -427,13 +430,13 @@ def _margin(comparison: Inequality) -> str:
 
 def _precision(results: Results, data: dict[str, Any], megabytes: float) -> str:
     if not data["views"]:
-        return "No images are stored beside these results; the machine that made them has them, in images/."
+        return "No images are stored with these results; they are in images/ on the machine that made them."
     error = max_error(data["dropped"])
-    some = f"{len(data['views'])} of {data['stored']} stored views, so that this file stays below {megabytes:g} MB; "
+    subset = f"{len(data['views'])} of {data['stored']} stored views, so that this file stays below {megabytes:g} MB; "
     return (
-        (some if len(data["views"]) < data["stored"] else f"{data['stored']} views; ")
-        + f"linear radiance within {100 * error:.2g} % ({255 * 1.055 / 2.4 * error:.2g} of 255 levels as displayed); "
-        f"images and their metrics are of seed {results.manifest['seeds'][0]}."
+        (subset if len(data["views"]) < data["stored"] else f"{data['stored']} views; ")
+        + f"linear radiance accurate to {100 * error:.2g} % ({255 * 1.055 / 2.4 * error:.2g} of 255 display levels); "
+        f"images and their metrics are from seed {results.manifest['seeds'][0]}."
     )
 
 
@@ -442,8 +445,8 @@ def _provenance(results: Results) -> str:
     configs = manifest.pop("configs", {})
     facts = "".join(f"<dt>{escape(k.replace('_', ' '))}</dt><dd>{_fact(v)}</dd>" for k, v in manifest.items())
     keys = [key for key in QUANTITIES if any(math.isfinite(run.get(key, math.nan)) for run in results.runs)]
-    every = Table(
-        "Every run",
+    table = Table(
+        "All runs",
         "",
         [*_RUN, *map(heading, keys)],
         [
@@ -453,8 +456,8 @@ def _provenance(results: Results) -> str:
     )
     columns = [f"runs.csv, column {name}" for name in (*_RUN, *keys)]
     cells = [["" for _ in _RUN] + [_plain(run.get(key)) for key in keys] for run in results.runs]
-    grid = _grid("runs", every.title, every, _Origins(_measured(results), columns, cells=cells))
-    return f"<dl>{facts}</dl>{_titled(every, grid)}<h3>Configurations</h3>" + "".join(
+    grid = _grid("runs", table.title, table, _Origins(_measurement(results), columns, cells=cells))
+    return f"<dl>{facts}</dl>{_titled(table, grid)}<h3>Configurations</h3>" + "".join(
         f"<details><summary>{escape(label(method))}</summary>"
         f"<pre>{escape(yaml.safe_dump(config, sort_keys=False))}</pre></details>"
         for method, config in configs.items()
@@ -468,5 +471,5 @@ def _fact(value: Any) -> str:
 
 
 def _plain(value: Any) -> str:
-    """Of a CSV's cell: NaN stands for an empty one."""
+    """Return a CSV cell's text; NaN stands for an empty cell."""
     return "" if value is None or value != value else str(value)

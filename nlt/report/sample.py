@@ -1,4 +1,4 @@
-"""`nlt data show`: one sample of a dataset as pictures."""
+"""`nlt data show`: a figure of one sample of a dataset."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nlt.report.figures import draw_sample
 
 
 def show_sample(place: str, split: str, index: int, output: Path) -> Path:
-    """Draw sample `index` of an evaluated split and return the picture's path.
+    """Draw sample `index` of an evaluated split and return the figure's path.
 
     Raises:
         UserError: there is no such dataset or sample.
@@ -22,6 +22,6 @@ def show_sample(place: str, split: str, index: int, output: Path) -> Path:
     directory = open_path(place)
     dataset = LightTransportDataset(directory, read_spec(directory), split)
     if not 0 <= index < len(dataset):
-        raise UserError(f"{directory}: --index: {split} has samples 0 to {len(dataset) - 1}, not {index}")
+        raise UserError(f"{directory}: --index: must be 0 to {len(dataset) - 1} for {split}, is {index}")
     draw_sample(output, default_collate([dataset[index]]))
     return output

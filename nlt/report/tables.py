@@ -1,4 +1,4 @@
-"""The tables of a comparison, made from results on disk: as CSV, Markdown and LaTeX."""
+"""The tables of a comparison, made from stored results: CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nlt.evaluation.paper import label, paper, published
 from nlt.evaluation.results import OK, Results, write_rows
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 
-# Metrics that the paper lacks.
+# Metrics that the paper does not report.
 _FEATURE_LAYERS = tuple(key for key in METRICS if key.startswith("feature_l1_"))
 _MORE = ("unbiased_mse", "psnr", "flip", "kid", *_FEATURE_LAYERS)
 _SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
@@ -23,19 +23,19 @@ _SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as text, a row per method or whatever else `first` says; the first column is its name."""
+    """A table of text cells; `first` is the heading of the first column, which names the row."""
 
     title: str
     note: str
     columns: list[str]
     rows: list[list[str]]
-    # Of each column: its quantity, and the results that it is from. Empty for a table that is not of quantities.
+    # The quantity of each column and the results that it is from; empty for a table of other things.
     sources: list[tuple[str, Results]] = field(default_factory=list)
     first: str = "method"
 
 
 def tables(results: Results) -> list[Table]:
-    """Every table of a comparison: the paper's columns, other metrics, sizes, stages, intervals; times by device."""
+    """Return all tables: the paper's columns, other metrics, sizes, stages, intervals, times by device."""
     table = results.manifest["table"]
     seeds = len(results.manifest["seeds"])
     note = f"N = {results.manifest['n_test']} test views; " + (
@@ -43,40 +43,40 @@ def tables(results: Results) -> list[Table]:
     )
     if table:
         note += (
-            f" After the slash the paper's figures ({paper()[table]['scale']}, a GPU). Another scale and other scenes: "
-            "compare the order of the methods, not the numbers."
+            f" After the slash: the paper's numbers ({paper()[table]['scale']}, on a GPU). Its scale and scenes are "
+            "different, so compare the order of the methods, not the numbers."
         )
     if variant := results.manifest.get("variant"):
-        note += f" Every training has the output and settings of configs/variant/{variant}.yaml, not the paper's."
+        note += f" All trainings use the output and settings of configs/variant/{variant}.yaml instead of the paper's."
     if results.floor:
         note += (
-            " The last row judges one half of the reference against the other: a perfect picture would differ from the "
-            "reference, which is their mean, by a quarter of this MSE. A value marked ≈ is closer to the best of its "
-            "column than the last row is to a perfect value: the reference cannot tell the two apart."
+            " The last row judges one half of the reference against the other. The reference is the mean of both, so a "
+            "perfect image would still differ from it by a quarter of this MSE. A value marked ≈ is closer to the best "
+            "of its column than the last row is to a perfect value, so the reference cannot tell the two apart."
         )
-    teachers = [f"{teacher} in {s}" for s, teacher in results.manifest.get("teachers", {}).items() if teacher != "path"]
-    if teachers:
-        note += f" Path tracing rows, OIDN's and denoising's input: traced by {', '.join(teachers)}."
+    integrators = [f"{name} in {s}" for s, name in results.manifest.get("teachers", {}).items() if name != "path"]
+    if integrators:
+        note += f" Path-traced rows and the inputs of OIDN and denoising are rendered with {', '.join(integrators)}."
     times = (*(f"{stage}_s" for stage in STAGES), "moving_camera_s")
     stages = tuple(key for key in times if any(_measured(results, key)))
     bounds = [key for key in ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1") if _measured(results, key)]
     interval = lambda _, method, key: " to ".join(text(key, bound) for bound in results.interval(method, key))
-    here = lambda keys: [(key, results) for key in keys]
-    found = [
-        _table(results, paper()[table]["title"] if table else "Comparison", note, here(COLUMNS), table=table),
-        _table(results, "Further metrics", "", here(_MORE)),
-        _table(results, "Sizes", "FLOPs and memory are the network's, the renderer's not included.", here(_SIZES)),
-        _table(results, "Time per stage", "Medians.", here((*stages, "time_per_frame_p95_s"))),
-        _table(results, "95% bootstrap intervals over test views", "", here(bounds), interval),
+    own = lambda keys: [(key, results) for key in keys]
+    result = [
+        _table(results, paper()[table]["title"] if table else "Comparison", note, own(COLUMNS), table=table),
+        _table(results, "Further metrics", "", own(_MORE)),
+        _table(results, "Sizes", "FLOPs and memory are those of the network, without the renderer.", own(_SIZES)),
+        _table(results, "Time per stage", "Medians.", own((*stages, "time_per_frame_p95_s"))),
+        _table(results, "95% bootstrap intervals over test views", "", own(bounds), interval),
     ]
     if len(results.devices) > 1:
         on_each = [("time_per_frame_s", results.on(device)) for device in results.devices]
         names = ", ".join(f"({k}) {device}" for k, device in enumerate(results.devices, 1))
-        note = f"{names}. The other tables are of the first."
+        note = f"{names}. The other tables have the times of (1)."
         by_device = _table(results, "Time per frame by device", note, on_each)
         columns = [f"{column}, ({k})" for k, column in enumerate(by_device.columns, 1)]
-        found.append(dataclasses.replace(by_device, columns=columns))
-    return found
+        result.append(dataclasses.replace(by_device, columns=columns))
+    return result
 
 
 def _measured(results: Results, key: str) -> list[str]:
@@ -90,8 +90,8 @@ def _name(results: Results, method: str) -> str:
 
 def _cell(results: Results, method: str, key: str) -> str:
     mean, std, best = results.mean(method, key), results.std(method, key), results.best(key)
-    is_near = best not in (None, method) and results.is_below_floor(key, mean - results.mean(str(best), key))
-    return text(key, mean) + (f" ± {text(key, std)}" if math.isfinite(std) else "") + " ≈" * is_near
+    is_tied = best not in (None, method) and results.is_below_floor(key, mean - results.mean(str(best), key))
+    return text(key, mean) + (f" ± {text(key, std)}" if math.isfinite(std) else "") + " ≈" * is_tied
 
 
 def _table(
@@ -104,8 +104,11 @@ def _table(
 ) -> Table:
     rows = []
     for method in results.methods:
-        theirs = published(table, method)
-        cells = [cell(of, method, key) + (f" / {theirs[key]:g}" if key in theirs else "") for key, of in sources]
+        paper_row = published(table, method)
+        cells = [
+            cell(source, method, key) + (f" / {paper_row[key]:g}" if key in paper_row else "")
+            for key, source in sources
+        ]
         rows.append([_name(results, method), *cells])
     if cell is _cell and any(key in results.floor for key, _ in sources):
         rows.append([FLOOR, *(text(key, results.floor.get(key)) for key, _ in sources)])
@@ -113,19 +116,19 @@ def _table(
 
 
 def write_tables(results: Results) -> None:
-    """table.csv with every number unrounded, table.md and table.tex."""
-    found = tables(results)
+    """Write table.csv with unrounded numbers, table.md and table.tex."""
+    all_tables = tables(results)
     rows = [_summary(results, method) for method in results.methods]
     if results.floor:
         rows.append({"method": FLOOR, "status": OK, "n_test": results.manifest["n_test"], **results.floor})
     write_rows(results.directory / "table.csv", rows)
-    write_texts(results, "table", found)
+    write_texts(results, "table", all_tables)
 
 
-def write_texts(results: Results, name: str, found: list[Table], source: str = "runs.csv, views.csv") -> None:
-    """Tables as `name`.md and `name`.tex. `source`: the files that the numbers come from."""
-    write_bytes(results.directory / f"{name}.md", _markdown(found, source).encode())
-    write_bytes(results.directory / f"{name}.tex", _latex(found).encode())
+def write_texts(results: Results, name: str, all_tables: list[Table], source: str = "runs.csv, views.csv") -> None:
+    """Write tables as `name`.md and `name`.tex; `source` names the files that the numbers come from."""
+    write_bytes(results.directory / f"{name}.md", _markdown(all_tables, source).encode())
+    write_bytes(results.directory / f"{name}.tex", _latex(all_tables).encode())
 
 
 def _summary(results: Results, method: str) -> dict[str, Any]:
@@ -144,7 +147,7 @@ def _summary(results: Results, method: str) -> dict[str, Any]:
 
 
 def as_markdown(table: Table, level: int) -> list[str]:
-    """Its lines, below a heading of this level."""
+    """Return a table's lines in Markdown, below a heading of this level."""
     return [
         f"{'#' * level} {table.title}", "", *([table.note, ""] if table.note else []),
         f"| {table.first} | {' | '.join(table.columns)} |", "|---|" + "---:|" * len(table.columns),
@@ -152,11 +155,11 @@ def as_markdown(table: Table, level: int) -> list[str]:
     ]  # fmt: skip
 
 
-def _markdown(found: list[Table], source: str) -> str:
+def _markdown(all_tables: list[Table], source: str) -> str:
     lines = []
-    for number, table in enumerate(found, 1):
+    for number, table in enumerate(all_tables, 1):
         lines += as_markdown(table, min(number, 2))
-    return "\n".join([*lines, f"Where the numbers come from: manifest.json, {source}."]) + "\n"
+    return "\n".join([*lines, f"Source of the numbers: manifest.json, {source}."]) + "\n"
 
 
 _LATEX = {
@@ -165,11 +168,11 @@ _LATEX = {
 }  # fmt: skip
 
 
-def _latex(found: list[Table]) -> str:
-    """For a document with \\usepackage{booktabs}."""
+def _latex(all_tables: list[Table]) -> str:
+    """Return the tables in LaTeX; the document needs \\usepackage{booktabs}."""
     escape = lambda line: re.sub(r"[&%$#_{}±↓↑≈–]", lambda match: _LATEX[match[0]], line)
     lines = []
-    for table in found:
+    for table in all_tables:
         caption = escape(f"{table.title}. {table.note}".strip())
         lines += [
             r"\begin{table}", r"\centering\footnotesize", f"\\caption{{{caption}}}",

@@ -1,7 +1,7 @@
-"""A described scene, loaded into Mitsuba so that moving an object rebuilds nothing that did not move.
+"""Load a described scene into Mitsuba so that moving an object does not rebuild the rest of the scene.
 
-What never moves and each movable object are shape groups with an acceleration structure of their own; a state
-only sets their instances' transforms. Emitting shapes cannot be instanced and stay plain meshes.
+The static part and each movable object are shape groups with their own acceleration structures; a state only sets the
+transforms of their instances. Emitting shapes cannot be instanced and stay plain meshes.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from nlt.scenes.meshes import live_mesh
 from nlt.scenes.model import Triangles
 from nlt.scenes.state import SceneState, rest_state
 
-# A removed object shrinks to a speck of a micrometre: no ray meets it, and no kernel has to be compiled anew for
-# a scene with fewer shapes.
+# A removed object shrinks to the size of a micrometre. No ray hits it, and no kernel has to be recompiled for a scene
+# with fewer shapes.
 _SPECK = 1e-6
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A triangle mesh. `vertices` (V, 3) in metres, `faces` (F, 3), `uv` (V, 2) or None, live BSDF and emitter."""
+    """A triangle mesh: `vertices` (V, 3) in metres, `faces` (F, 3), `uv` (V, 2) or None, Mitsuba BSDF and emitter."""
 
     id: str
     vertices: np.ndarray
@@ -42,21 +42,21 @@ class Shape:
 
     @property
     def face_areas(self) -> np.ndarray:
-        """(F,) m²."""
+        """The area (F,) of each face in m²."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 class Scene:
-    """A scene in one experiment, in one state at a time.
+    """A scene in one experiment and one state at a time.
 
     Args:
-        description: of the scene.
+        description: the scene's description.
         experiment: "static" and "fixed_lights" keep the scene's own emitters; "moving_lights" turns them all off
             and hangs one rectangular area light under the ceiling instead (Sec. Dynamic Objects and Dynamic Lights).
 
     Raises:
-        UserError: the file does not load, a shape is missing, or nothing emits light.
+        UserError: the file cannot be loaded, a shape is missing, or nothing emits light.
     """
 
     def __init__(self, description: SceneDescription, experiment: str) -> None:
@@ -91,7 +91,7 @@ class Scene:
                 claimed[shape] = movable.name
 
     def _assemble(self, meshes: dict[str, Any]) -> None:
-        """One instance per movable object and one for the rest; emitters and environment beside them."""
+        """Create one instance per movable object and one for the rest; emitters and the environment stay separate."""
         parts: dict[str, Any] = {"type": "scene"}
         owner = {shape: m.name for m in self.movables for shape in m.shapes}
         groups: dict[str, dict[str, Any]] = {}
@@ -101,7 +101,7 @@ class Scene:
             else:
                 groups.setdefault(owner.get(name, STATIC), {})[name] = mesh
         for key, members in groups.items():
-            # Meshes of one BSDF become one: kernels are traced, and what is frozen is looked through, shape by shape.
+            # Merge the meshes of one BSDF, because tracing and checking frozen kernels takes time for every shape.
             merged = mi.load_dict({"type": "merge", **members})
             merged = merged if isinstance(merged, list) else [merged]
             group = mi.load_dict({"type": "shapegroup", **{str(k): mesh for k, mesh in enumerate(merged)}})
@@ -138,7 +138,7 @@ class Scene:
 
     def _moving_light(self) -> dict[str, Any]:
         light = self.description.light
-        assert light is not None  # movables() has said so
+        assert light is not None  # otherwise movables() raises
         return {
             "type": "rectangle",
             "to_world": self._light_transform(np.zeros(3)),
@@ -147,8 +147,8 @@ class Scene:
         }
 
     def _light_shape(self) -> Shape:
-        """The moving light's quad, so that points are sampled on it too."""
-        # Its own BSDF and emitter: others beside them would join every virtual call of a compiled kernel.
+        """Return the quad of the moving light, so that points are sampled on it too."""
+        # Reuse the light's BSDF and emitter: additional ones would join every virtual call of a compiled kernel.
         (rectangle,) = [s for s in self.mi_scene.shapes() if s.id() == f"emitter_{MOVING_LIGHT}"]
         vertices, faces = light_quad(self.description)
         return Shape(MOVING_LIGHT, vertices, faces, None, rectangle.bsdf(), rectangle.emitter())
@@ -163,7 +163,7 @@ class Scene:
         return mi.ScalarTransform4f(matrix.tolist())
 
     def set_state(self, state: SceneState) -> None:
-        """Move and remove objects; the next rays see the new state."""
+        """Move and remove objects. The next rays see the new state."""
         self.state = state
         units = self.description.units_per_metre
         for movable, translation, present in zip(self.movables, state.translation, state.present, strict=True):
@@ -181,12 +181,12 @@ class Scene:
         if len(self._parameters):
             self._parameters.update()
             if is_jit():
-                # Otherwise the transforms are literals, and every state compiles its kernels anew.
+                # Otherwise the transforms are literals, and every state recompiles the kernels.
                 dr.make_opaque({key: self._parameters[key] for key in self._parameters.keys()})  # noqa: SIM118
 
     @contextmanager
     def in_state(self, state: SceneState) -> Iterator[None]:
-        """The scene in another state for a while."""
+        """Put the scene into another state for the duration of the context."""
         before = self.state
         self.set_state(state)
         try:
@@ -196,7 +196,7 @@ class Scene:
 
     @property
     def lit(self) -> SceneState:
-        """At rest, without those objects that emit light and are removed: what the emitters' powers depend on."""
+        """The state at rest without the removed emitters; the powers of all emitters depend on nothing else."""
         emits = np.array([bool(self._moving_meshes[movable.name]) for movable in self.movables], bool)
         return SceneState(np.zeros_like(self.state.translation), self.state.present | ~emits)
 
@@ -206,7 +206,7 @@ class Scene:
 
 
 def light_quad(description: SceneDescription) -> tuple[np.ndarray, np.ndarray]:
-    """The moving light where its translation is zero: vertices (4, 3) in metres, faces (2, 3)."""
+    """The moving light at zero translation: vertices (4, 3) in metres, faces (2, 3)."""
     light = description.light
     assert light is not None
     corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
@@ -220,13 +220,13 @@ def _some(names: set[str]) -> str:
 
 
 def _facing_down(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes +z, a rectangle's normal, to -up, and +x to the first horizontal axis."""
+    """Return the rotation (3, 3) that maps +z, a rectangle's normal, to -up and +x to the first horizontal axis."""
     first = np.eye(3)[int(up[0] == 1)]
     return np.stack([first, np.cross(-up, first), -up], axis=1)
 
 
 def load_source(description: SceneDescription) -> Any:
-    """The scene that a description names, live and as it is in its file."""
+    """Load the scene that a description refers to, without changing it."""
     if description.path is None:
         from nlt.scenes import builtin
 
@@ -239,7 +239,7 @@ def load_source(description: SceneDescription) -> Any:
 
 
 def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True) -> Shape:
-    """A live mesh, in metres; without its emitter if the scene's own lights are off."""
+    """Convert a Mitsuba mesh to a shape in metres, without its emitter if the scene's own lights are off."""
     parameters = mi.traverse(mesh)
     uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
     return Shape(
@@ -253,7 +253,7 @@ def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True)
 
 
 def read_triangles(mesh: Any) -> Triangles:
-    """A live mesh, in the scene's units."""
+    """Return the triangles of a Mitsuba mesh, in scene units."""
     old = mi.traverse(mesh)
     column = lambda key, n: np.array(old[key]).reshape(-1, n)
     normals = column("vertex_normals", 3) if mesh.has_vertex_normals() else None
@@ -262,5 +262,5 @@ def read_triangles(mesh: Any) -> Triangles:
 
 
 def _without_emitter(mesh: Any, shape: Shape) -> Any:
-    """The same mesh, turned off: an emitter of zero radiance would still be sampled and add noise."""
+    """Return the mesh without its emitter. An emitter of zero radiance would still be sampled and add noise."""
     return live_mesh(shape.id, read_triangles(mesh), shape.bsdf)

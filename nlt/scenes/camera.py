@@ -1,4 +1,4 @@
-"""The perspective camera: K, world-to-view, and the rays through pixel centres."""
+"""The perspective camera: intrinsics, world-to-view transform and the rays through pixel centres."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; conventions as in `nlt.data.sample` (x right, y down, z forward; metres).
+    """A pinhole camera. Conventions are those of `nlt.data.sample`: x right, y down, z forward, in metres.
 
     Attributes:
-        matrix: (3, 3) K, view space to pixels.
-        world_to_view: (4, 4) T, rigid.
+        matrix: (3, 3) intrinsics K, from view space to pixels.
+        world_to_view: (4, 4) rigid transform T.
     """
 
     matrix: np.ndarray
@@ -25,7 +25,7 @@ class Camera:
     def look_at(
         cls, position: np.ndarray, target: np.ndarray, up: np.ndarray, fov: float, width: int, height: int
     ) -> Camera:
-        """A camera at `position` facing `target`, with a horizontal field of view `fov` in degrees."""
+        """A camera at `position` that faces `target`, with a horizontal field of view `fov` in degrees."""
         forward = np.asarray(target, float) - position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, up)
@@ -35,7 +35,7 @@ class Camera:
         world_to_view[:3, 3] = -world_to_view[:3, :3] @ position
         focal = width / 2 / np.tan(np.radians(fov) / 2)
         matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-        # Stored samples are float32: round here, so that what is rendered is what is stored.
+        # Stored samples are float32. Rounding here makes the rendered camera equal to the stored one.
         return cls(matrix.astype(np.float32), world_to_view.astype(np.float32), width, height)
 
     @property
@@ -45,7 +45,7 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) world position of the camera's centre, float64."""
+        """(3,) world position of the camera centre, float64."""
         return -self.rotation @ self.world_to_view[:3, 3]
 
     @property
@@ -66,8 +66,8 @@ class Camera:
         return np.stack([columns.ravel(), rows.ravel()], 1) + 0.5
 
     def view_directions(self) -> np.ndarray:
-        """(3, H, W) float32 view direction map: world, unit, through pixel centres (Sec. Method)."""
-        # As `directions`, but along rows and columns: every epoch makes one of these for every sample.
+        """(3, H, W) float32 view direction map: unit world directions through pixel centres (Sec. Method)."""
+        # Faster than `directions`, because it works along rows and columns: every epoch needs a map for every sample.
         focal, centre = np.diag(self.matrix)[:2].astype(float), self.matrix[:2, 2].astype(float)
         x = (np.arange(self.width) + 0.5 - centre[0]) / focal[0]
         y = ((np.arange(self.height) + 0.5 - centre[1]) / focal[1])[:, None]

@@ -1,4 +1,4 @@
-"""`nlt scenes list`: every description of configs/scenes, read without a renderer."""
+"""`nlt scenes list`: all descriptions in configs/scenes, read without a renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nlt.scenes.description import load_description
 
 
 def listing() -> str:
-    """A line per description; one that cannot be read says why on its own line."""
+    """Return a table with one line per description; the line of a broken description holds its error."""
     rows = [("scene", "source", "objects", "moving light", "teacher")]
     broken = []
     for name in config_names("scenes"):
@@ -19,8 +19,8 @@ def listing() -> str:
         except UserError as error:
             broken.append(f"{name}  broken: {error}")
             continue
-        here = "built in" if scene.path is None else "here" if Path(scene.path).is_file() else "not here"
-        rows.append((name, here, str(len(scene.objects)), "yes" if scene.light else "no", scene.teacher))
+        location = "built in" if scene.path is None else "here" if Path(scene.path).is_file() else "not here"
+        rows.append((name, location, str(len(scene.objects)), "yes" if scene.light else "no", scene.teacher))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines + broken)

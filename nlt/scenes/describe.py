@@ -1,4 +1,4 @@
-"""`nlt scenes show`, `check` and `add`: what a scene holds, in words, and a first description of a new one."""
+"""`nlt scenes show`, `check` and `add`: summarise a scene, and write a first description of a new scene."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nlt.scenes.importer import Imported, read
 from nlt.scenes.pointcloud import material
 from nlt.scenes.proposal import Proposal, propose
 
-_FAR = 1e6  # of float32's 7 digits none is left for a millimetre
+_FAR = 1e6  # at this coordinate, the 7 digits of float32 leave none for a millimetre
 
 
 def show(name: str) -> str:
-    """A description in words (lengths in metres), and what its scene has."""
+    """Return a summary of a description (lengths in metres) and of its scene."""
     description = load_description(name)
     source = load_source(description)
     shapes = [read_shape(mesh, description.units_per_metre) for mesh in source.shapes()]
@@ -43,10 +43,10 @@ def show(name: str) -> str:
 
 
 def check(path: Path) -> str:
-    """Load a scene file and say what it holds and what a description of it could say; lengths in scene units.
+    """Load a scene file and return a summary of it and of a proposed description; lengths in scene units.
 
     Raises:
-        UserError: it cannot be loaded, see `importer.read`.
+        UserError: the file cannot be loaded, see `importer.read`.
     """
     imported, shapes, proposal = _propose(path)
     environment = imported.scene.environment() is not None
@@ -70,15 +70,15 @@ def check(path: Path) -> str:
 
 
 def add(path: Path, name: str | None = None, output: Path | None = None) -> Path:
-    """Write a description of a scene file to edit; returns where.
+    """Write a first description of a scene file, to be edited, and return its path.
 
     Raises:
-        UserError: the file cannot be loaded, or the description exists already.
+        UserError: the file cannot be loaded, or the description already exists.
     """
     name = name or re.sub(r"[^\w-]+", "_", path.resolve().parent.name if path.stem == "scene" else path.stem)
     file = output or CONFIGS / "scenes" / f"{name}.yaml"
     if file.exists():
-        raise UserError(f"{file}: is there already; choose another with --name or -o, or delete it")
+        raise UserError(f"{file}: already exists; choose another with --name or -o, or delete it")
     imported, _, proposal = _propose(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(_yaml(path, name, imported, proposal))
@@ -90,19 +90,19 @@ def _propose(path: Path) -> tuple[Imported, dict[str, Shape], Proposal]:
     shapes = {mesh.id(): read_shape(mesh) for mesh in imported.scene.shapes()}
     for shape in shapes.values():
         if not np.isfinite(shape.vertices).all():
-            raise UserError(f"{path}: shape {shape.id}: a vertex is not a finite number; repair the mesh")
+            raise UserError(f"{path}: shape {shape.id}: a vertex is not finite; repair the mesh")
     return imported, shapes, propose(imported.scene, shapes, imported.up)
 
 
 def _warnings(imported: Imported, proposal: Proposal) -> list[str]:
-    said = list(imported.warnings)
+    messages = list(imported.warnings)
     if not imported.scene.emitters():
-        said.append("nothing emits light: only moving_lights will work")
+        messages.append("nothing emits light: only moving_lights will work")
     if np.abs(proposal.bounds).max() > _FAR:
-        said.append(
-            f"coordinates reach {np.abs(proposal.bounds).max():.3g}: too far for float32; move or scale the scene"
+        messages.append(
+            f"coordinates reach {np.abs(proposal.bounds).max():.3g}, too far for float32: move or scale the scene"
         )
-    return said
+    return messages
 
 
 def _contents(shapes: Iterable[Shape], environment: bool) -> list[str]:
@@ -144,19 +144,19 @@ def _yaml(path: Path, name: str, imported: Imported, proposal: Proposal) -> str:
         f"  {_word(o.name)}: {{shapes: [{', '.join(map(_word, o.shapes))}], box: {pair(o.box)}}}\n"
         for o in proposal.objects
     )
-    return f"""# Written by `nlt scenes add`: guesses to check and edit. Lengths in scene units.
-# See it with: nlt scenes preview {name} -o {name}.png
+    return f"""# Written by `nlt scenes add`. All values are guesses: check and edit them. Lengths are in scene units.
+# Preview: nlt scenes preview {name} -o {name}.png
 {warnings}name: {_word(name)}
 source: {_word(str(source.relative_to(root) if source.is_relative_to(root) else source))}
 units_per_metre: {proposal.units_per_metre:g}  # {because["units_per_metre"]}
 up: {proposal.up}  # {because["up"]}
-exposure: 1.0  # check: `nlt scenes preview` says which would suit
+exposure: 1.0  # check: `nlt scenes preview` suggests a value
 fov: 70.0
 camera: {{min: {_numbers(proposal.camera[0])}, max: {_numbers(proposal.camera[1])}}}  # {because["camera"]}
 room: {pair(proposal.room)}  # check: {because["room"]}
-# Check the objects and rename them: shapes that touch were taken as one; a box holds the allowed translations.
+# Check and rename the objects. Shapes that touch form one object; `box` bounds its translations.
 objects:{"" if proposal.objects else " {}"}
-{objects}moving_light:  # check: below the ceiling and above everything else
+{objects}moving_light:  # check: it must be below the ceiling and above everything else
   size: {_numbers(light.size)}
   radiance: {_numbers(light.radiance)}
   box: {pair(light.box)}
@@ -164,5 +164,5 @@ objects:{"" if proposal.objects else " {}"}
 
 
 def _word(text: str) -> str:
-    """A string as YAML; quoted if it has to be."""
+    """Return a string as YAML, quoted if necessary."""
     return text if re.fullmatch(r"[\w./-]+", text) and yaml.safe_load(text) == text else json.dumps(text)

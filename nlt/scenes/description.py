@@ -1,7 +1,7 @@
-"""What `scene.yaml` says of a scene, read strictly: movable objects, camera volume, exposure, moving light.
+"""Strict reader of `scene.yaml`: movable objects, camera volume, exposure, moving light.
 
-Lengths in the file are in the scene's own units, so that they can be read off its XML; here, as everywhere
-else in nlt, they are metres.
+Lengths in the file are in scene units, so that they can be read off the scene's XML. In this module, as everywhere
+else in nlt, they are in metres.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from nlt.scenes.sources import scene_files
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
 Teacher = Literal["path", "bdpt"]
-TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that make the images to learn from
-# Material type of a surface, by the lobes of its BSDF; the index into this tuple is what is stored.
+TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that render the images to learn from
+# Material types of surfaces, by the lobes of their BSDFs. Datasets store the index into this tuple.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
-MOVING_LIGHT = "moving_light"  # its name as a movable object, and its shape id
-STATIC = "static"  # the name of what never moves
+MOVING_LIGHT = "moving_light"  # the light's name as a movable object, and its shape id
+STATIC = "static"  # the name of the parts that never move
 UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 BUILTIN = "builtin:"
 
 
 @dataclass(frozen=True)
 class Movable:
-    """An object that a state translates or removes: `box` (2, 3) holds its allowed translations, metres."""
+    """An object that a state translates or removes; `box` (2, 3) bounds its translations, in metres."""
 
     name: str
     shapes: tuple[str, ...]
@@ -44,9 +44,9 @@ class Movable:
 
 @dataclass(frozen=True)
 class MovingLight:
-    """The rectangular ceiling light of the dynamic-lights experiment; `box` (2, 3): its centre's positions.
+    """The rectangular ceiling light of the dynamic-lights experiment; lengths in metres.
 
-    `size` (2,) is along the two horizontal axes, in order.
+    `box` (2, 3) bounds the positions of its centre. `size` (2,) is along the two horizontal axes, in axis order.
     """
 
     size: np.ndarray
@@ -55,17 +55,17 @@ class MovingLight:
 
     @property
     def centre(self) -> np.ndarray:
-        """Where it hangs when its translation is zero."""
+        """The position (3,) of the light at zero translation."""
         return self.box.mean(0)
 
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """One `scene.yaml`, lengths in metres. `camera` and `look_at` are (2, 3) boxes (supp., View Sampling); unless
-    the file has one, `look_at` is half as large as `camera` and in its middle.
+    """The content of a `scene.yaml`, lengths in metres.
 
-    `room` (2, 3) bounds the inside of the room, None where the whole scene is meant. `teacher` is the integrator
-    with the lower variance at equal time in this scene.
+    `camera` and `look_at` are (2, 3) boxes (supp., View Sampling). If the file has no `look_at`, it is half as large as
+    `camera` and has the same centre. `room` (2, 3) bounds the inside of the room; None stands for the whole scene.
+    `teacher` is the integrator with the lower variance at equal time in this scene.
     """
 
     name: str
@@ -83,7 +83,11 @@ class SceneDescription:
     teacher: str = "path"
 
     def movables(self, experiment: str) -> tuple[Movable, ...]:
-        """What a state of this experiment moves: nothing, the objects, or the objects and the light."""
+        """Return the objects that a state of this experiment moves: none, all objects, or all objects and the light.
+
+        Raises:
+            UserError: the experiment moves the light, and the file has no `moving_light`.
+        """
         if experiment == "static":
             return ()
         if experiment == "fixed_lights":
@@ -95,12 +99,15 @@ class SceneDescription:
 
     @property
     def path(self) -> Path | None:
-        """The scene file; None for a built-in scene."""
+        """The scene file, or None for a built-in scene."""
         return None if self.source.startswith(BUILTIN) else Path(self.source)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over everything the scene is made of: `scene.yaml`, the scene file and the files it names."""
+        """SHA-256 over all files of the scene: `scene.yaml`, the scene file and the files that it refers to.
+
+        For a built-in scene, every module in `builtin` counts: even a new comment there renames its datasets.
+        """
         files = [self.file]
         if self.path is None:
             files += sorted(Path(__file__).with_name("builtin").glob("*.py"))
@@ -113,7 +120,7 @@ class SceneDescription:
 
 
 class Section:
-    """A mapping of the file that knows its name, for error messages, and which keys were asked for."""
+    """A mapping in a file. It rejects unknown keys, and its name appears in error messages."""
 
     def __init__(self, file: Path, name: str, data: Any, known: tuple[str, ...]) -> None:
         self.file, self.name = file, name
@@ -139,8 +146,8 @@ class Section:
         except (TypeError, ValueError):
             array = np.array(np.nan)
         if array.shape != shape or not np.isfinite(array).all():
-            what = "a number" if shape == () else f"numbers of shape {' x '.join(map(str, shape))}"
-            raise UserError(f"{self.file}: {self.field(key)}: must be {what}, is {self.data.get(key)!r}")
+            expected = "a number" if shape == () else f"numbers of shape {' x '.join(map(str, shape))}"
+            raise UserError(f"{self.file}: {self.field(key)}: must be {expected}, is {self.data.get(key)!r}")
         return array
 
     def positive(self, key: str, shape: tuple[int, ...] = (), default: Any = None) -> np.ndarray:
@@ -150,14 +157,14 @@ class Section:
         return array
 
     def degrees(self, key: str, default: float) -> float:
-        """A field of view."""
+        """A field of view in degrees, between 0 and 180."""
         angle = float(self.positive(key, default=default))
         if angle >= 180:
             raise UserError(f"{self.file}: {self.field(key)}: must be below 180 degrees, is {angle:g}")
         return angle
 
     def flag(self, key: str) -> bool:
-        """False where it is not given."""
+        """A boolean, False if absent."""
         value = self.get(key, False)
         if not isinstance(value, bool):
             raise UserError(f"{self.file}: {self.field(key)}: must be true or false, is {value!r}")
@@ -166,7 +173,7 @@ class Section:
     def box(self, key: str) -> np.ndarray:
         box = self.numbers(key, (2, 3))
         if (box[0] > box[1]).any():
-            raise UserError(f"{self.file}: {self.field(key)}: is empty: minimum {box[0]} above maximum {box[1]}")
+            raise UserError(f"{self.file}: {self.field(key)}: is empty: minimum {box[0]} is above maximum {box[1]}")
         return box
 
     def min_max(self, key: str) -> np.ndarray:
@@ -178,10 +185,10 @@ class Section:
 
 
 def load_description(name: str, need_source: bool = True) -> SceneDescription:
-    """Read `configs/scenes/<name>.yaml`, or the file at a path.
+    """Read `configs/scenes/<name>.yaml`, or the file at the path `name`.
 
     Raises:
-        UserError: the file, or its scene where one is needed, is missing; a key is unknown or missing; a box is empty.
+        UserError: the file is missing or has a mistake, or its scene file is missing although `need_source`.
     """
     file = find_config("scenes", name)
     try:
@@ -206,12 +213,12 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     if teacher not in TEACHERS:
         raise UserError(f"{file}: teacher: must be one of {', '.join(TEACHERS)}, is {teacher!r}")
     objects = []
-    named = data.get("objects") or {}
-    if not isinstance(named, Mapping):
-        raise UserError(f"{file}: objects: must be a mapping from names to shapes and box, is {named!r}")
-    for key, value in named.items():
+    entries = data.get("objects") or {}
+    if not isinstance(entries, Mapping):
+        raise UserError(f"{file}: objects: must be a mapping from names to shapes and box, is {entries!r}")
+    for key, value in entries.items():
         if key in (MOVING_LIGHT, STATIC):
-            raise UserError(f"{file}: objects.{key}: this name is taken; choose another name")
+            raise UserError(f"{file}: objects.{key}: this name is reserved; choose another name")
         section = Section(file, f"objects.{key}", value, ("shapes", "box"))
         shapes = section.get("shapes")
         if not isinstance(shapes, list) or not shapes:
@@ -245,12 +252,12 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
 def _find_source(file: Path, source: str, needed: bool) -> str:
     if source.startswith(BUILTIN):
         return source
-    tried = [Path(source)] if Path(source).is_absolute() else [file.parent / source, scenes_root() / source]
-    for path in tried:
+    candidates = [Path(source)] if Path(source).is_absolute() else [file.parent / source, scenes_root() / source]
+    for path in candidates:
         if path.is_file():
             return str(path.resolve())
     if not needed:
-        return str(tried[-1])
+        return str(candidates[-1])
     raise UserError(
-        f"{file}: source: no scene file at {' or '.join(map(str, tried))}; set NLT_SCENES to the scenes' folder"
+        f"{file}: source: no scene file at {' or '.join(map(str, candidates))}; set NLT_SCENES to the scenes' folder"
     )

@@ -1,4 +1,4 @@
-"""Any scene file as a live Mitsuba scene of triangle meshes, one per shape, each under a stable id of its own."""
+"""Load any scene file as a Mitsuba scene of triangle meshes, one per shape, each with a unique, reproducible id."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 
 @dataclass(frozen=True)
 class Imported:
-    """A loaded file. `warnings` says what could not be kept; `camera` (4, 4) is its sensor's pose, `up` its up axis."""
+    """A loaded file. `warnings` lists what was lost, `camera` (4, 4) is its sensor's pose and `up` its up axis."""
 
     path: Path
     scene: Any
@@ -34,20 +34,20 @@ class Imported:
 
 
 def load(path: Path) -> Any:
-    """The file as a `mi.Scene` of meshes; the same file gives the same scene."""
+    """Return the file as a `mi.Scene` of meshes. The same file always gives the same scene."""
     return read(path).scene
 
 
 def read(path: Path) -> Imported:
-    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the variant that is set.
+    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the active variant.
 
     Raises:
-        UserError: it is none of them, files that it names are missing (all are listed), or Mitsuba refuses it.
+        UserError: the file has another format, it refers to missing files (all are listed), or Mitsuba refuses it.
     """
     suffix = path.suffix.lower()
     if not path.is_file():
-        what = "a folder, not a scene file" if path.is_dir() else "no such file"
-        raise UserError(f"{path}: {what}; give a file ending in {', '.join(SUFFIXES)}")
+        problem = "a folder, not a scene file" if path.is_dir() else "no such file"
+        raise UserError(f"{path}: {problem}; give a file ending in {', '.join(SUFFIXES)}")
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: {suffix or 'no suffix'}: nlt reads scene files ending in {', '.join(SUFFIXES)}")
     imported = _read_xml(path) if suffix == ".xml" else _read_model(path)
@@ -57,9 +57,9 @@ def read(path: Path) -> Imported:
 
 
 def check_missing(path: Path, missing: list[str]) -> None:
-    """One error that names every file that is not there."""
+    """Raise one UserError that lists all missing files, if any."""
     if missing:
-        raise UserError(f"{path}: missing: {', '.join(sorted(missing))}; put them there, paths are from {path.parent}")
+        raise UserError(f"{path}: missing: {', '.join(sorted(missing))}; add them, paths are relative to {path.parent}")
 
 
 def _read_xml(path: Path) -> Imported:
@@ -76,7 +76,7 @@ def _read_xml(path: Path) -> Imported:
         camera = _matrix(document.sensor.find("transform"))
         axis = int(np.abs(camera[:3, 1]).argmax())
         up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
-    return Imported(path, scene, _said(warnings), camera, up)
+    return Imported(path, scene, _format_warnings(warnings), camera, up)
 
 
 def _read_model(path: Path) -> Imported:
@@ -84,18 +84,18 @@ def _read_model(path: Path) -> Imported:
     is_obj = path.suffix.lower() == ".obj"
     model = read_obj(path) if is_obj else read_gltf(path)
     scene = _build(model)
-    return Imported(path, scene, _said(model.warnings), up=None if is_obj else "y")
+    return Imported(path, scene, _format_warnings(model.warnings), up=None if is_obj else "y")
 
 
 def _build(model: Model) -> Any:
-    """Live meshes of a model's parts, under their names, and a small sphere for every lamp."""
+    """Build a scene of a model's parts, under their names, with a small sphere for every lamp."""
     parts = list(model.parts)
     for name, position, intensity in model.lamps:
         ball = curved("sphere")
         ball = Triangles(ball.vertices * LAMP_RADIUS + position, ball.faces, ball.normals, ball.uv)
         radiance = tuple(intensity / (np.pi * LAMP_RADIUS**2))
         parts.append((name, ball, Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
-    bsdfs: dict[int, Any] = {}  # one per material: each instance costs tracing time
+    bsdfs: dict[int, Any] = {}  # one per material, because each instance costs tracing time
     meshes: dict[str, Any] = {}
     for name, triangles, material in parts:
         if len(triangles.faces) == 0:
@@ -109,38 +109,38 @@ def _build(model: Model) -> Any:
     return mi.load_dict({"type": "scene", **meshes})
 
 
-def _said(warnings: Counter[str]) -> tuple[str, ...]:
+def _format_warnings(warnings: Counter[str]) -> tuple[str, ...]:
     return tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
 
 
-class _Collect(mi.Appender):
-    """Mitsuba's warnings, kept instead of printed."""
+class _WarningCounter(mi.Appender):
+    """Counts Mitsuba's warnings instead of printing them."""
 
-    def __init__(self, into: Counter[str]) -> None:
+    def __init__(self, counts: Counter[str]) -> None:
         super().__init__()
-        self.into = into
+        self.counts = counts
 
     def append(self, level: Any, text: str) -> None:
         plugin = re.search(r'in (\w+) plugin of type "(\w+)"', text)
         names = re.findall(r'^ +- \w+ "(\w+)"', text, re.MULTILINE)
         for name in names if plugin is not None else ():
             assert plugin is not None
-            self.into[f"{name} of {plugin[1]} {plugin[2]} is left out: Mitsuba 3 does not know it"] += 1
+            self.counts[f"{name} of {plugin[1]} {plugin[2]} is ignored: Mitsuba 3 does not know it"] += 1
         if not names and level >= mi.LogLevel.Warn:
-            self.into[re.sub(r"^\S+ \S+ \w+ +\[\w+(\.cpp:\d+)?\] ", "", " ".join(text.split()))] += 1
+            self.counts[re.sub(r"^\S+ \S+ \w+ +\[\w+(\.cpp:\d+)?\] ", "", " ".join(text.split()))] += 1
 
     def log_progress(self, *_: Any) -> None: ...
 
 
 def _instantiate(path: Path, xml: str, warnings: Counter[str]) -> Any:
-    """Mitsuba's parser, which upgrades old names; shapes are not merged, so that they keep their ids."""
+    """Instantiate a scene with Mitsuba's parser, which upgrades old names. Shapes are not merged and keep their ids."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     config.merge_equivalent = config.merge_meshes = False
     config.unused_properties = mi.LogLevel.Warn
     logger: Any = mi.logger()  # type: ignore[operator]
     before = [logger.appender(k) for k in range(logger.appender_count())]
     logger.clear_appenders()
-    logger.add_appender(_Collect(warnings))
+    logger.add_appender(_WarningCounter(warnings))
     try:
         state = mi.parser.parse_string(config, xml)
         mi.parser.transform_all(config, state)
@@ -158,7 +158,7 @@ def _instantiate(path: Path, xml: str, warnings: Counter[str]) -> Any:
 
 
 def _matrix(transform: ET.Element | None) -> np.ndarray:
-    """(4, 4) of a `<transform>`, as Mitsuba reads it."""
+    """Return the matrix (4, 4) of a `<transform>`, as Mitsuba reads it."""
     if transform is None:
         return np.eye(4)
     xml = ET.Element("scene", version=mitsuba_xml.OLD)
@@ -170,13 +170,13 @@ def _matrix(transform: ET.Element | None) -> np.ndarray:
 
 
 def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
-    """Turn an analytic shape into a mesh in a file; Mitsuba says where its centre, radius and ends put it."""
+    """Replace an analytic shape by a mesh file; Mitsuba derives the placement from its centre, radius and ends."""
     kind, file = shape.get("type", ""), str(folder / f"{shape.get('id')}.ply")
     place = [c for c in shape if c.tag in ("transform", "point", "float")]
     root = ET.Element("scene", version=mitsuba_xml.OLD)
     ET.SubElement(root, "shape", type=kind).extend(place)
     (probe,) = mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False).shapes()
-    if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices a scene's parameters would not show
+    if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices are not among the scene's parameters
         probe.write_ply(file)
     else:
         matrix = np.array(mi.traverse(probe)["to_world"].matrix, float).reshape(4, 4)

@@ -1,4 +1,4 @@
-"""One kernel, two ways to run it: vectorised in Mitsuba's JIT variants, in a loop in the scalar one."""
+"""Run one kernel in any variant: vectorised in Mitsuba's JIT variants, in a Python loop in the scalar variant."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ log = logging.getLogger(__name__)
 
 
 def is_jit() -> bool:
-    """Whether the active Mitsuba variant computes on arrays."""
+    """Return whether the active Mitsuba variant computes on arrays."""
     return bool(dr.is_jit_v(mi.Float))
 
 
 def freeze(kernel: Callable) -> Callable:
-    """The kernel, traced once and not at every call: 6 ms instead of 300 ms for a 64x64 image at 1 spp.
+    """Wrap a kernel so that Dr.Jit traces it only once: 6 ms instead of 300 ms for a 64x64 image at 1 spp.
 
-    Where Dr.Jit cannot freeze it, it is traced at every call, with a warning. Seen with lights of textured radiance:
-    Mitsuba finds a point on one by tracing rays through its texture coordinates, as a scene of their own.
+    A kernel that Dr.Jit cannot freeze is traced at every call, with a warning. This happens with lights of textured
+    radiance, because Mitsuba samples them by tracing rays in a separate scene of their texture coordinates.
     """
     if not is_jit():
         return kernel
@@ -37,16 +37,16 @@ def freeze(kernel: Callable) -> Callable:
                 if "record()" not in str(error):
                     raise
                 run = kernel
-                log.warning("rendering slowly: %s cannot be frozen (%s)", kernel.__name__, error.__cause__)
+                log.warning("rendering is slow: Dr.Jit cannot freeze %s (%s)", kernel.__name__, error.__cause__)
         return kernel(**values)
 
     return call
 
 
 def owned(values: np.ndarray) -> Any:
-    """Flat float32 or uint32 values for a mesh parameter, in memory of Dr.Jit's own.
+    """Return values for a mesh parameter, flat, as float32 or uint32, in memory that Dr.Jit owns.
 
-    With numpy's, Embree was seen to read freed memory under frozen kernels.
+    With memory owned by numpy, Embree read freed memory under frozen kernels.
     """
     if not is_jit():
         return values.ravel().tolist()
@@ -60,9 +60,9 @@ def launch(kernel: Callable, lanes: Mapping[str, tuple[str, np.ndarray]], **fixe
     """Run `kernel(**fixed, **lanes)` over all lanes.
 
     Args:
-        kernel: returns a tuple of Mitsuba values; written once for scalars and arrays alike.
-        lanes: name -> (Mitsuba type name such as "Point3f", array of shape (n,) or (n, k)).
-        fixed: passed to the kernel as they are.
+        kernel: returns a tuple of Mitsuba values; it must work on scalars and on arrays.
+        lanes: name -> (name of a Mitsuba type, for example "Point3f"; array of shape (n,) or (n, k)).
+        fixed: passed to the kernel unchanged.
 
     Returns:
         One array (n,) or (n, k) per value that the kernel returns.
@@ -81,7 +81,7 @@ def launch(kernel: Callable, lanes: Mapping[str, tuple[str, np.ndarray]], **fixe
     return tuple(np.array([np.array(value) for value in column]) for column in zip(*results, strict=True))
 
 
-# Component by component: Dr.Jit's own conversions of whole vectors compile a kernel for every number of lanes.
+# Arrays are converted by component: Dr.Jit's conversions of whole vectors compile a kernel for every number of lanes.
 
 
 def _upload(kind: Any, array: np.ndarray) -> Any:
@@ -92,5 +92,5 @@ def _upload(kind: Any, array: np.ndarray) -> Any:
 def _download(value: Any, count: int) -> np.ndarray:
     if dr.depth_v(value) > 1:
         return np.stack([_download(component, count) for component in value], axis=-1)
-    # What is the same for all lanes comes back once.
+    # A value that is the same for all lanes has a width of one.
     return np.broadcast_to(np.array(value), count)

@@ -1,4 +1,4 @@
-"""Opacity masks: rays pass through the transparent parts of a surface, such as those between leaves drawn on a quad."""
+"""Opacity masks: rays pass through the transparent parts of a surface, like the gaps between leaves drawn on a quad."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import mitsuba as mi
 from nlt.scenes.lanes import is_jit
 
 _OPAQUE = 0.5  # A surface stops rays where its opacity is at least this.
-_MOST_LAYERS = 64  # A ray stops at the latest after as many transparent layers.
+_MOST_LAYERS = 64  # A ray passes at most this many transparent layers.
 
 
 def is_mask(bsdf: Any) -> Any:
-    """Whether a BSDF may have transparent parts. Thin glass has none, although it does not bend light either."""
+    """Return whether a BSDF may have transparent parts. Thin glass has none, although it does not refract."""
     flags, flag = bsdf.flags(), mi.BSDFFlags
     deltas = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
     # Mitsuba flags the transmission of thin glass as Null too, but its other lobe is a delta.
@@ -23,17 +23,17 @@ def is_mask(bsdf: Any) -> Any:
 
 
 def is_transparent(bsdf: Any, interaction: Any) -> Any:
-    """Whether the BSDF is a mask and its opacity at the interaction is below one half."""
+    """Return whether the BSDF is a mask with an opacity below one half at the interaction."""
     transmission = dr.mean(mi.Color3f(bsdf.eval_null_transmission(interaction)))
     return is_mask(bsdf) & (transmission > 1 - _OPAQUE)
 
 
 def first_surface(scene: Any, ray: Any, masks: bool) -> Any:
-    """The first interaction of a ray with a surface that is not transparent there.
+    """Return the first interaction of a ray with a surface that is not transparent there.
 
     Args:
-        ray: the `t` of the interaction is measured from its origin.
-        masks: whether the scene has any masks (`Scene.masks`); without them this is Mitsuba's `ray_intersect`.
+        ray: the interaction's `t` is measured from the ray's origin.
+        masks: whether the scene has any masks (`Scene.masks`). Without masks, this is Mitsuba's `ray_intersect`.
     """
     interaction = scene.ray_intersect(ray)
     if not masks:

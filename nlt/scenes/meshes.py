@@ -1,4 +1,4 @@
-"""Live Mitsuba meshes, BSDFs and emitters from arrays, and the curved shapes of Mitsuba as triangles."""
+"""Create Mitsuba meshes, BSDFs and emitters from arrays, and triangulate Mitsuba's curved shapes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from nlt.scenes.lanes import owned
 from nlt.scenes.mitsuba_xml import linear
 from nlt.scenes.model import Material, Triangles
 
-_COLUMNS, _ROWS = 64, 32  # around and along a curved shape: a sphere's area is 0.3% short
+_COLUMNS, _ROWS = 64, 32  # around and along a curved shape; a sphere's area is 0.3% too small
 
 
 def live_mesh(name: str, triangles: Triangles, surface: Any = None, light: Any = None) -> mi.Mesh:
-    """A mesh of the variant that is set; `surface`, a BSDF, and `light`, an emitter, are live objects."""
+    """Create a mesh in the active variant. `surface` is a Mitsuba BSDF object, `light` a Mitsuba emitter object."""
     properties = mi.Properties()
     for key, value in (("mesh_bsdf", surface), ("mesh_emitter", light)):
         if value is not None:
@@ -40,7 +40,7 @@ def live_mesh(name: str, triangles: Triangles, surface: Any = None, light: Any =
 
 
 def curved(kind: str) -> Triangles:
-    """Mitsuba's unit `sphere`, `disk` or `cylinder` (along z, 0 to 1), with its normals and texture coordinates."""
+    """Triangulate Mitsuba's unit `sphere`, `disk` or `cylinder` (along z, 0 to 1), with normals and `uv`."""
     rows = _ROWS if kind == "sphere" else 1
     along, around = (
         g.ravel() for g in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, _COLUMNS + 1), indexing="ij")
@@ -57,13 +57,13 @@ def curved(kind: str) -> Triangles:
     below = first + _COLUMNS + 1
     faces = np.concatenate([np.hstack([first, first + 1, below]), np.hstack([below, first + 1, below + 1])])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    faces = np.where((across * normals[faces].mean(1)).sum(1, keepdims=True) < 0, faces[:, ::-1], faces)
-    return Triangles(vertices, faces[np.linalg.norm(across, axis=1) > 1e-9], normals, uv)
+    face_normals = np.cross(b - a, c - a)
+    faces = np.where((face_normals * normals[faces].mean(1)).sum(1, keepdims=True) < 0, faces[:, ::-1], faces)
+    return Triangles(vertices, faces[np.linalg.norm(face_normals, axis=1) > 1e-9], normals, uv)
 
 
 def bsdf(material: Material) -> dict[str, Any]:
-    """The nearest BSDF of Mitsuba: diffuse, plastic, conductor or glass where it is one of these, else `principled`."""
+    """Return the nearest Mitsuba BSDF: diffuse, plastic, conductor or glass if one of these fits, else `principled`."""
     colour = _texture(material.colour, material.image)
     alpha = max(material.roughness**2, 1e-3)
     smooth = material.roughness < 0.05
@@ -106,14 +106,14 @@ def bsdf(material: Material) -> dict[str, Any]:
 
 
 def emitter(material: Material) -> dict[str, Any] | None:
-    """Its area light, None where it does not shine."""
+    """Return the material's area light, or None if it does not emit."""
     if not any(material.emission):
         return None
     return {"type": "area", "radiance": _texture(material.emission, material.emission_image)}
 
 
 def _texture(colour: tuple[float, ...], image: Image.Image | None) -> dict[str, Any]:
-    """A linear colour, times an sRGB image if there is one."""
+    """Return a linear colour, multiplied by an sRGB image if there is one."""
     if image is None:
         return {"type": "rgb", "value": list(colour)}
     pixels = np.asarray(image.convert("RGB"))
@@ -124,7 +124,7 @@ def _texture(colour: tuple[float, ...], image: Image.Image | None) -> dict[str, 
 
 
 def _channel(factor: float, image: Image.Image | None, band: int, cutoff: float | None = None) -> Any:
-    """A number, times one band of an image if there is one; 0 or 1 if there is a cutoff."""
+    """Return a number, multiplied by one band of an image if there is one; a cutoff rounds it to 0 or 1."""
     if image is None:
         return factor if cutoff is None else float(factor >= cutoff)
     bands = np.asarray(image.convert("L") if len(image.getbands()) == 1 else image.convert("RGB"), np.float32) / 255

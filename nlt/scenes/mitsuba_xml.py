@@ -1,8 +1,8 @@
-"""Mitsuba scene files of versions 0.5 to 3.x, rewritten into what Mitsuba 3 reads; no Mitsuba needed.
+"""Convert Mitsuba scene files of versions 0.5 to 3.x into XML that Mitsuba 3 reads. Needs no Mitsuba.
 
-Mitsuba itself renames the old properties (`toWorld`, `diffuseReflectance`, `uscale`). What it refuses is rewritten
-here: elements and plugins that it no longer has become the nearest it has, which is said in a warning. Sensors,
-integrators, films, samplers and media are left out: nlt brings its own.
+Mitsuba itself renames old properties (`toWorld`, `diffuseReflectance`, `uscale`). This module handles what Mitsuba
+refuses: it replaces elements and plugins that no longer exist by their nearest equivalents, with a warning. It drops
+media, which nlt does not trace, and sensors, integrators, films and samplers, because nlt has its own.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import numpy as np
 
 from nlt.errors import UserError
 
-OLD = "0.6.0"  # the version from which Mitsuba upgrades names; harmless for newer files
-ANALYTIC = ("sphere", "disk", "cylinder", "rectangle", "cube")  # shapes to be turned into plain meshes
+OLD = "0.6.0"  # version written to the output, which makes Mitsuba upgrade old names; harmless for newer files
+ANALYTIC = ("sphere", "disk", "cylinder", "rectangle", "cube")  # shapes that the importer converts to meshes
 _MESHES = ("obj", "ply", "serialized")
 _DROPPED = ("integrator", "film", "sampler", "rfilter", "medium", "subsurface", "phase", "volume")
 _ENVIRONMENTS = ("envmap", "constant", "sunsky", "timed_sunsky")
-LAMP_RADIUS = 0.05  # scene units: of the small lamp that stands in for a point light
+LAMP_RADIUS = 0.05  # scene units; radius of the small lamp that replaces a point light
 
 
 @dataclass
 class Document:
-    """A scene, its includes and parameters resolved. `warnings` counts equal ones; `sensor` is the file's first."""
+    """A scene with includes and parameters resolved. `warnings` counts duplicates; `sensor` is the first one."""
 
     path: Path
     root: ET.Element = field(default_factory=lambda: ET.Element("scene"))
@@ -47,10 +47,10 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """Read and rewrite a scene file.
+    """Read and convert a scene file.
 
     Raises:
-        UserError: it is no Mitsuba scene.
+        UserError: the file is not a Mitsuba scene.
     """
     document = Document(path)
     folders = [path.parent]
@@ -74,7 +74,7 @@ def read(path: Path) -> Document:
 
 
 def _resolve(document: Document, path: Path, folders: list[Path], values: dict[str, str]) -> ET.Element:
-    """The file's root, $parameters replaced and includes put in their place."""
+    """Return the root of the file, with $parameters substituted and includes inlined."""
     document.files.append(path)
     try:
         root = ET.parse(path).getroot()
@@ -120,7 +120,7 @@ def _find(name: str, folders: list[Path]) -> Path:
 
 
 def _property(element: ET.Element, name: str) -> ET.Element | None:
-    """A child by its name in Mitsuba 3; `intIOR` is found as `int_ior`."""
+    """Return the child with this name in Mitsuba 3; `int_ior` also finds `intIOR`."""
     for child in element:
         if child.get("name") and snake_case(child.get("name", "")) == name:
             return child
@@ -128,25 +128,25 @@ def _property(element: ET.Element, name: str) -> ET.Element | None:
 
 
 def snake_case(name: str) -> str:
-    """Mitsuba 3's spelling of a property of Mitsuba 0.x."""
+    """Convert a property name from Mitsuba 0.x to Mitsuba 3."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def _pop(element: ET.Element, name: str) -> ET.Element | None:
-    found = _property(element, name)
-    if found is not None:
-        element.remove(found)
-    return found
+    child = _property(element, name)
+    if child is not None:
+        element.remove(child)
+    return child
 
 
 def linear(encoded: np.ndarray) -> np.ndarray:
-    """sRGB to linear, both in [0, 1]."""
+    """Convert sRGB to linear, both in [0, 1]."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _number(element: ET.Element, name: str, default: float) -> float:
-    found = _property(element, name)
-    return default if found is None else _number_of(found, default)
+    child = _property(element, name)
+    return default if child is None else _number_of(child, default)
 
 
 def _number_of(element: ET.Element, default: float) -> float:
@@ -162,7 +162,7 @@ def _set(element: ET.Element, tag: str, name: str, value: object) -> None:
 
 
 def _become(element: ET.Element, other: ET.Element) -> None:
-    """Turn an element into another one, in its place and under its name and id."""
+    """Replace an element by another one in place; it keeps its own name and id."""
     kept = {k: v for k, v in element.attrib.items() if k in ("name", "id")}
     taken = {k: v for k, v in other.attrib.items() if k not in ("name", "id")}
     element.tag, element.text, element.attrib = other.tag, None, {**taken, **kept}
@@ -175,9 +175,9 @@ def _become(element: ET.Element, other: ET.Element) -> None:
 
 
 def _transform(element: ET.Element) -> ET.Element:
-    """Its `to_world`, made where it has none."""
-    found = element.find("transform")
-    return ET.SubElement(element, "transform", name="to_world") if found is None else found
+    """Return the `to_world` of an element, created if absent."""
+    child = element.find("transform")
+    return ET.SubElement(element, "transform", name="to_world") if child is None else child
 
 
 def _drop(document: Document, root: ET.Element) -> None:
@@ -189,11 +189,11 @@ def _drop(document: Document, root: ET.Element) -> None:
                 media += medium
                 parent.remove(child)
     if media:
-        document.warn("media and subsurface scattering are left out: nlt traces surfaces only")
+        document.warn("media and subsurface scattering are ignored: nlt traces only surfaces")
 
 
 def _flatten_shapes(document: Document, root: ET.Element) -> None:
-    """Instances become copies, merged shapes their parts; what cannot be a mesh is left out."""
+    """Replace instances by copies and merged shapes by their parts; drop shapes that cannot become a mesh."""
     groups = {e.get("id"): e for e in root.iter("shape") if e.get("type") == "shapegroup"}
     flat: list[ET.Element] = []  # the scene's children, in order
 
@@ -214,7 +214,7 @@ def _flatten_shapes(document: Document, root: ET.Element) -> None:
                 shape.set("id", prefix + name)
             flat.append(shape)
         else:
-            document.warn(f"shape {name or '(no id)'} is a {kind}, not a surface of triangles: left out")
+            document.warn(f"shape {name or '(no id)'} is a {kind} and is ignored: it cannot become a triangle mesh")
 
     for child in root:
         if child.tag != "shape":
@@ -225,21 +225,21 @@ def _flatten_shapes(document: Document, root: ET.Element) -> None:
 
 
 def _drop_unused(root: ET.Element) -> None:
-    """Keep only the top-level BSDFs and textures that a shape or emitter refers to, by their own or an inner id."""
+    """Keep only the top-level BSDFs and textures that a shape or emitter refers to, by their own or a nested id."""
     tops = {
         e: {i.get("id"): i for i in e.iter() if i.get("id") and i.tag != "ref"}
         for e in root
         if e.tag in ("bsdf", "texture", "spectrum")
     }
-    home = {key: top for top, inner in tops.items() for key in inner if key}
+    owner = {key: top for top, inner in tops.items() for key in inner if key}
     used: set[str] = set()
     waiting = [e for e in root if e not in tops]
     while waiting:
         for reference in waiting.pop().iter("ref"):
             key = reference.get("id", "")
-            if key in home and key not in used:
+            if key in owner and key not in used:
                 used.add(key)
-                waiting.append(tops[home[key]][key])  # type: ignore[index]
+                waiting.append(tops[owner[key]][key])  # type: ignore[index]
     for top, inner in tops.items():
         wanted = [i for key, i in inner.items() if key in used]
         if top in wanted:
@@ -252,7 +252,7 @@ def _drop_unused(root: ET.Element) -> None:
 
 
 def _values(document: Document, element: ET.Element) -> None:
-    """Values in a spelling that Mitsuba 3 reads."""
+    """Rewrite a value in a spelling that Mitsuba 3 reads."""
     value = element.get("value", "")
     if element.tag == "lookAt":
         element.tag = "lookat"
@@ -260,7 +260,7 @@ def _values(document: Document, element: ET.Element) -> None:
         for axis in "xyz":
             element.attrib.setdefault(axis, "0")
     elif element.tag == "spectrum" and value and ":" not in value:
-        element.tag = "rgb"  # one or three plain numbers: what Mitsuba 0.x in its RGB mode took as linear RGB
+        element.tag = "rgb"  # one or three plain numbers, which the RGB mode of Mitsuba 0.x read as linear RGB
     elif element.tag == "blackbody":
         scaled = element.get("scale")
         kelvin = element.get("temperature", "6500").strip().rstrip("Kk")
@@ -268,7 +268,7 @@ def _values(document: Document, element: ET.Element) -> None:
         element.attrib = {"type": "blackbody", "name": element.get("name", "")}
         _set(element, "float", "temperature", kelvin)
         if scaled:
-            document.warn("the scale of a blackbody spectrum is left out")
+            document.warn("the scale of a blackbody spectrum is ignored")
     if element.tag == "srgb" or (element.tag == "rgb" and value.startswith("#")):
         if value.startswith("#"):
             encoded = np.array([int(value[k : k + 2], 16) for k in (1, 3, 5)]) / 255
@@ -279,7 +279,7 @@ def _values(document: Document, element: ET.Element) -> None:
 
 
 def _rewrite(document: Document, parent: ET.Element, index: dict[str, ET.Element]) -> None:
-    """Depth first: plugins and options that Mitsuba 3 does not have become the nearest that it has."""
+    """Replace, depth first, plugins and options that Mitsuba 3 does not have by their nearest equivalents."""
     for element in list(parent):
         _rewrite(document, element, index)
         if element.tag == "bsdf":
@@ -289,18 +289,18 @@ def _rewrite(document: Document, parent: ET.Element, index: dict[str, ET.Element
         elif element.tag == "emitter":
             _emitter(document, parent, element)
         elif element.tag == "shape":
-            named = element.findall("ref")
-            if len(named) > 1:
+            references = element.findall("ref")
+            if len(references) > 1:
                 document.warn(
-                    f"shape with {len(named)} materials: the first, {named[0].get('id')}, is taken for all of it"
+                    f"shape with {len(references)} materials: the first, {references[0].get('id')}, is used everywhere"
                 )
-                for reference in named[1:]:
+                for reference in references[1:]:
                     element.remove(reference)
 
 
 @cache
 def _installed() -> tuple[frozenset[str], frozenset[str]]:
-    """Mitsuba's plugins and its conductors' materials, as files of the installed package."""
+    """Return the names of Mitsuba's plugins and of its conductor materials, read from the installed package."""
     spec = importlib.util.find_spec("mitsuba")
     assert spec is not None and spec.origin is not None
     folder = Path(spec.origin).parent
@@ -309,7 +309,7 @@ def _installed() -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _inner(element: ET.Element, index: dict[str, ET.Element]) -> ET.Element | None:
-    """The BSDF below this one, seen through references and `twosided`."""
+    """Return the BSDF nested in this one, looking through references and `twosided`."""
     for child in element:
         target = index.get(child.get("id", "")) if child.tag == "ref" else child
         if target is not None and target.tag == "bsdf":
@@ -333,10 +333,10 @@ def _bsdf(document: Document, element: ET.Element, index: dict[str, ET.Element])
         if inner.get("type") == "diffuse":
             element.set("type", "plastic" if kind == "coating" else "roughplastic")
             _replace_by(element, inner, {"reflectance": "diffuse_reflectance"})
-            document.warn(f"Mitsuba 3 has no {kind}: over a diffuse surface it is taken as {element.get('type')}")
+            document.warn(f"Mitsuba 3 has no {kind}: over a diffuse surface, {element.get('type')} replaces it")
         else:
             _become(element, inner)
-            document.warn(f"Mitsuba 3 has no {kind}: the coat over a {inner.get('type')} is left out")
+            document.warn(f"Mitsuba 3 has no {kind}: the coating of a {inner.get('type')} is ignored")
     elif kind in ("phong", "ward"):
         if kind == "phong":
             alpha = np.sqrt(2 / (_number(element, "exponent", 30) + 2))
@@ -346,10 +346,10 @@ def _bsdf(document: Document, element: ET.Element, index: dict[str, ET.Element])
             _pop(element, name)
         element.set("type", "roughplastic")
         _set(element, "float", "alpha", f"{max(alpha, 1e-3):.6g}")
-        document.warn(f"Mitsuba 3 has no {kind}: taken as roughplastic of the same width")
+        document.warn(f"Mitsuba 3 has no {kind}: replaced by roughplastic of the same width")
     elif kind == "mixturebsdf":
         _mixture(element)
-        document.warn("Mitsuba 3 has no mixturebsdf: taken as blendbsdf")
+        document.warn("Mitsuba 3 has no mixturebsdf: replaced by blendbsdf")
     elif kind == "difftrans":
         element.set("type", "principledthin")
         colour = _pop(element, "transmittance")
@@ -357,9 +357,9 @@ def _bsdf(document: Document, element: ET.Element, index: dict[str, ET.Element])
             colour.set("name", "base_color")
             element.append(colour)
         _set(element, "float", "diff_trans", 2)
-        document.warn("Mitsuba 3 has no difftrans: taken as principledthin that transmits diffusely")
+        document.warn("Mitsuba 3 has no difftrans: replaced by a principledthin that transmits diffusely")
     elif kind == "twosided" and inner is not None and _transmits(inner, index):
-        if inner.get("type") == "mask":  # the mask has two sides by itself; what it masks may have one
+        if inner.get("type") == "mask":  # a mask is always two-sided, but the BSDF inside it may not be
             masked = next((c for c in inner if c.tag in ("bsdf", "ref")), None)
             copied = copy.deepcopy(inner)
             target = _inner(inner, index)
@@ -376,12 +376,12 @@ def _bsdf(document: Document, element: ET.Element, index: dict[str, ET.Element])
         element[:] = [] if colour is None else [colour]
         if colour is not None:
             colour.set("name", "reflectance")
-        document.warn(f"Mitsuba 3 has no {kind}: taken as diffuse")
+        document.warn(f"Mitsuba 3 has no {kind}: replaced by diffuse")
     _lobes(document, element)
 
 
 def _replace_by(element: ET.Element, inner: ET.Element, rename: dict[str, str]) -> None:
-    """Give a coat the properties of what it coats, instead of what it coats."""
+    """Give a coating the properties of the BSDF inside it, in place of that BSDF."""
     kept = [c for c in element if snake_case(c.get("name", "")) in ("int_ior", "ext_ior", "alpha", "distribution")]
     for child in copy.deepcopy(list(inner)):
         name = snake_case(child.get("name", ""))
@@ -392,10 +392,10 @@ def _replace_by(element: ET.Element, inner: ET.Element, rename: dict[str, str]) 
 
 
 def _mixture(element: ET.Element) -> None:
-    """n BSDFs with weights as n - 1 blends: each blend takes its share of what is left."""
-    found = _pop(element, "weights")
+    """Express n weighted BSDFs as n - 1 nested blends, each of which takes its share of the remaining weight."""
+    listed = _pop(element, "weights")
     parts = [c for c in element if c.tag in ("bsdf", "ref")]
-    weights = [float(w) for w in re.split(r"[\s,]+", found.get("value", "").strip())] if found is not None else []
+    weights = [float(w) for w in re.split(r"[\s,]+", listed.get("value", "").strip())] if listed is not None else []
     weights = (weights + [1.0] * len(parts))[: len(parts)]
     element.set("type", "blendbsdf")
     element[:] = []
@@ -408,26 +408,26 @@ def _mixture(element: ET.Element) -> None:
 
 
 def _lobes(document: Document, element: ET.Element) -> None:
-    """Microfacet options and materials that Mitsuba 3 does not know."""
+    """Replace microfacet options and conductor materials that Mitsuba 3 does not know."""
     kind = element.get("type", "")
     distribution = _property(element, "distribution")
     if distribution is not None and distribution.get("value") not in ("beckmann", "ggx"):
-        document.warn(f"microfacet distribution {distribution.get('value')}: taken as beckmann")
+        document.warn(f"microfacet distribution {distribution.get('value')}: replaced by beckmann")
         distribution.set("value", "beckmann")
     alpha = _property(element, "alpha")
     if kind == "roughplastic" and alpha is not None and alpha.tag == "texture":
         element.remove(alpha)
-        document.warn("roughplastic with a texture as alpha: taken as 0.1")
+        document.warn("roughplastic with a textured alpha: replaced by 0.1")
     material = _property(element, "material")
     if (
         kind in ("conductor", "roughconductor")
         and material is not None
         and material.get("value") not in _installed()[1]
     ):
-        document.warn(f"unknown conductor {material.get('value')}: taken as a perfect mirror")
+        document.warn(f"unknown conductor {material.get('value')}: replaced by a perfect mirror")
         material.set("value", "none")
     if kind in ("conductor", "roughconductor") and _pop(element, "ext_eta") is not None:
-        document.warn(f"ext_eta of {kind} is left out: Mitsuba 3 takes air")
+        document.warn(f"ext_eta of {kind} is ignored: Mitsuba 3 assumes air")
 
 
 def _texture(document: Document, element: ET.Element) -> None:
@@ -437,20 +437,20 @@ def _texture(document: Document, element: ET.Element) -> None:
         if filtering is not None and filtering.get("value") not in ("nearest", "bilinear"):
             element.remove(filtering)  # trilinear, ewa: Mitsuba 3 has no mipmaps
         if wrapping is not None and wrapping.get("value") not in ("repeat", "mirror", "clamp"):
-            document.warn(f"texture wrap mode {wrapping.get('value')}: taken as clamp")
+            document.warn(f"texture wrap mode {wrapping.get('value')}: replaced by clamp")
             wrapping.set("value", "clamp")
         if gamma is not None:
             element.remove(gamma)
             if _number_of(gamma, 0) == 1:
                 _set(element, "boolean", "raw", "true")
             else:
-                document.warn("a texture's gamma is left out: images are taken as sRGB")
+                document.warn("the gamma of a texture is ignored: images are read as sRGB")
         if _pop(element, "channel") is not None:
-            document.warn("a texture's channel is left out: all of the image is taken")
+            document.warn("the channel of a texture is ignored: the whole image is used")
     elif kind == "scale":
         inner = next((c for c in element if c.tag in ("texture", "rgb", "ref")), ET.Element("rgb", value="0.5"))
         _become(element, inner)
-        document.warn("Mitsuba 3 has no scale texture: what it scales is taken as it is")
+        document.warn("Mitsuba 3 has no scale texture: the texture inside it is used unscaled")
     elif kind == "vertexcolors":
         element.set("type", "mesh_attribute")
         element[:] = [ET.Element("string", {"name": "name", "value": "vertex_color"})]
@@ -459,7 +459,7 @@ def _texture(document: Document, element: ET.Element) -> None:
         element.attrib.pop("type")
         element.tag, element[:] = "rgb", []
         element.set("value", colour.get("value", "0.5") if colour is not None else "0.5")
-        document.warn(f"Mitsuba 3 has no texture {kind}: taken as one colour")
+        document.warn(f"Mitsuba 3 has no texture {kind}: replaced by one colour")
 
 
 def _emitter(document: Document, parent: ET.Element, element: ET.Element) -> None:
@@ -485,16 +485,16 @@ def _emitter(document: Document, parent: ET.Element, element: ET.Element) -> Non
         parent.remove(element)
         parent.append(lamp)
         document.warn(
-            f"a {kind} light is taken as a {lamp.get('type')} of radius {LAMP_RADIUS:g} of the same intensity"
+            f"a {kind} light is replaced by a {lamp.get('type')} of radius {LAMP_RADIUS:g} and the same intensity"
         )
     elif kind not in ("area", "directionalarea", *_ENVIRONMENTS):
         parent.remove(element)
-        document.warn(f"a {kind} light has no surface and no sky: left out")
+        document.warn(f"a {kind} light is ignored: nlt has only area lights and environments")
 
 
 def _sky(document: Document, element: ET.Element) -> None:
     kind = element.get("type")
-    if document.old:  # +y was up; now +z is
+    if document.old:  # up was +y in Mitsuba 0.x and is +z in Mitsuba 3
         _transform(element).insert(0, ET.Element("rotate", x="1", angle="-90"))
     scale = _pop(element, "scale")
     for part in ("sun", "sky"):
@@ -525,14 +525,14 @@ def _one_environment(document: Document, root: ET.Element) -> None:
             if _property(other, f"{absent[0]}_scale") is None:
                 _pop(first, f"{absent[0]}_scale")
         else:
-            document.warn(f"Mitsuba takes one environment: {first.get('type')} is kept, {other.get('type')} left out")
+            document.warn(f"Mitsuba allows one environment: {first.get('type')} is kept, {other.get('type')} ignored")
 
 
 def _name_shapes(root: ET.Element) -> None:
-    """Every shape gets a unique id that stays the same: its own, else its file's or its kind's name, numbered."""
+    """Give every shape a unique, reproducible id: its own, else the numbered name of its file or its type."""
     taken = {e.get("id", "") for e in root.iter() if e.get("id") and e.tag not in ("shape", "ref")}
     shapes = root.findall("shape")
-    shapes.sort(key=lambda s: s.get("id") is None)  # given ids come first
+    shapes.sort(key=lambda s: s.get("id") is None)  # shapes that have an id choose first
     for shape in shapes:
         file, part = _property(shape, "filename"), _property(shape, "shape_index")
         stem = Path(file.get("value", "")).stem if file is not None else shape.get("type", "")
@@ -544,12 +544,12 @@ def _name_shapes(root: ET.Element) -> None:
 
 
 def unique(name: str, taken: Container[str]) -> str:
-    """The name, numbered from 2 on if it is taken."""
+    """Return the name, numbered from 2 if it is taken."""
     return next(n for k in itertools.count(1) if (n := name if k == 1 else f"{name}_{k}") not in taken)
 
 
 def _locate(document: Document, root: ET.Element, folders: list[Path]) -> None:
-    """Absolute file names; every missing one is noted."""
+    """Make all file names absolute and record the missing files."""
     for element in _named_files(root):
         key = "filename" if "filename" in element.attrib else "value"
         name = element.get(key, "")

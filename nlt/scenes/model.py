@@ -1,4 +1,4 @@
-"""Models of glTF, GLB and OBJ files as arrays: named parts with a triangle mesh and a material; no renderer needed."""
+"""Read glTF, GLB and OBJ files as arrays: named parts, each a triangle mesh with a material. Needs no renderer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from nlt.scenes.mitsuba_xml import linear
 
 @dataclass(frozen=True)
 class Triangles:
-    """`vertices` (V, 3), `faces` (F, 3); `normals` (V, 3) and `uv` (V, 2) or None; v = 0 is an image's top row."""
+    """A mesh: `vertices` (V, 3), `faces` (F, 3); `normals` (V, 3) or None, `uv` (V, 2) or None; v = 0 is at the top."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -33,18 +33,18 @@ class Triangles:
 
 @dataclass
 class Material:
-    """A metallic-roughness material (glTF 2.0, Appendix B), colours linear; images multiply what stands before them."""
+    """A metallic-roughness material (glTF 2.0, Appendix B), colours linear; images multiply the factors above them."""
 
     colour: tuple[float, ...] = (0.8, 0.8, 0.8)
     image: Image.Image | None = None
     alpha: float = 1.0
     alpha_image: Image.Image | None = None
-    cutoff: float | None = None  # below it a surface is not there, above it solid
+    cutoff: float | None = None  # opacity below it counts as 0, all other opacity as 1
     metallic: float = 0.0
     roughness: float = 1.0
     rough_image: Image.Image | None = None  # roughness in green, metallic in blue
     transmission: float = 0.0
-    thin: bool = True  # a sheet that does not bend light
+    thin: bool = True  # a sheet that does not refract light
     ior: float = 1.5
     emission: tuple[float, ...] = (0.0, 0.0, 0.0)
     emission_image: Image.Image | None = None
@@ -52,7 +52,7 @@ class Material:
 
 @dataclass
 class Model:
-    """`parts`: name -> mesh and material, in the file's order; `lamps`: position, intensity (W/sr) of point lights."""
+    """A model: `parts` in the order of the file, and point lights `lamps` as name, position and intensity (W/sr)."""
 
     parts: list[tuple[str, Triangles, Material]] = field(default_factory=list)
     lamps: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
@@ -60,12 +60,12 @@ class Model:
 
 
 def named_files(path: Path) -> list[str]:
-    """The files that a model names, as it names them: buffers, images, materials."""
+    """Return the names of the files that a model refers to, as written in it: buffers, images, material libraries."""
     if path.suffix.lower() == ".obj":
         libraries = [words for words in _lines(path) if words[0] == "mtllib"]
         names = [" ".join(words[1:]) for words in libraries]
-        found = [path.parent / name for name in names]
-        inner = [words for f in found if f.is_file() for words in _lines(f) if words[0].lower() in _MAPS]
+        files = [path.parent / name for name in names]
+        inner = [words for f in files if f.is_file() for words in _lines(f) if words[0].lower() in _MAPS]
         return [*names, *sorted({words[-1].replace("\\", "/") for words in inner})]
     header, _ = _read_gltf(path)
     uris = [part.get("uri", "") for key in ("buffers", "images") for part in header.get(key, [])]
@@ -73,18 +73,18 @@ def named_files(path: Path) -> list[str]:
 
 
 def read_gltf(path: Path) -> Model:
-    """A glTF 2.0 or GLB file: its default scene, transforms applied.
+    """Read the default scene of a glTF 2.0 or GLB file, with its transforms applied.
 
     Raises:
-        UserError: it is no such file.
+        UserError: the file is not valid glTF 2.0.
     """
     header, rest = _read_gltf(path)
     model, materials = Model(), header.get("materials", [])
     for k, material in enumerate(materials):
-        material["name"] = str(k)  # so that a loaded part says which material it has
+        material["name"] = str(k)  # identifies the material of a loaded part
     for part in (*header.get("buffers", []), *header.get("images", [])):
         if not part.get("uri", "data:").startswith("data:"):
-            part["uri"] = unquote(part["uri"])  # trimesh looks for a file of that name
+            part["uri"] = unquote(part["uri"])  # trimesh opens the file of this name
     try:
         loaded = trimesh.load_scene(
             io.BytesIO(_pack(header, rest)),
@@ -92,14 +92,14 @@ def read_gltf(path: Path) -> Model:
             resolver=trimesh.resolvers.FilePathResolver(str(path)),
             process=False,
         )
-    except Exception as error:  # trimesh raises whatever the broken part of a file leads to
+    except Exception as error:  # a broken file can make trimesh raise any exception
         raise UserError(f"{path}: not readable as glTF 2.0: {type(error).__name__}: {error}") from None
-    read = [_gltf_material(m, model) for m in materials]
+    converted = [_gltf_material(m, model) for m in materials]
     for node in sorted(loaded.graph.nodes_geometry):
         matrix, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if not isinstance(mesh, trimesh.Trimesh):
-            model.warnings[f"{node} is made of points or lines: left out"] += 1
+            model.warnings[f"{node} consists of points or lines and is ignored"] += 1
             continue
         material, uv, source = Material((1.0, 1.0, 1.0)), None, None
         if isinstance(mesh.visual, trimesh.visual.TextureVisuals):
@@ -107,12 +107,12 @@ def read_gltf(path: Path) -> Model:
                 uv = np.asarray(mesh.visual.uv, float) * [1, -1] + [0, 1]
             if (mesh.visual.material.name or "").isdigit():
                 source = int(mesh.visual.material.name)
-                material = read[source]
+                material = converted[source]
                 _images(material, mesh.visual.material)
                 if "baseColorTexture" in materials[source].get("pbrMetallicRoughness", {}) and material.image is None:
-                    model.warnings["an image that cannot be read is left out"] += 1
+                    model.warnings["an unreadable image is ignored"] += 1
         elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.kind == "vertex":
-            model.warnings["colours of vertices are left out: the mean is taken"] += 1
+            model.warnings["vertex colours are replaced by their mean"] += 1
             material.colour = tuple(linear(np.asarray(mesh.visual.vertex_colors)[:, :3].mean(0) / 255))
         if uv is not None and source is not None:
             uv = _texture_transform(materials[source], uv)
@@ -134,7 +134,7 @@ def _placed(triangles: Triangles, matrix: np.ndarray) -> Triangles:
 
 
 def _read_gltf(path: Path) -> tuple[dict[str, Any], bytes | None]:
-    """The JSON, and what follows it in a GLB."""
+    """Return the JSON header and, for a GLB file, the bytes after it."""
     data, rest = path.read_bytes(), None
     if path.suffix.lower() == ".glb":
         if data[:4] != b"glTF" or len(data) < 20:
@@ -165,9 +165,9 @@ def _gltf_material(data: dict[str, Any], model: Model) -> Material:
     known = ("ior", "emissive_strength", "transmission", "volume", "unlit")
     for name in extensions:
         if name.removeprefix("KHR_materials_") not in known:
-            model.warnings[f"{name} is left out"] += 1
+            model.warnings[f"{name} is ignored"] += 1
     if "normalTexture" in data:
-        model.warnings["normal maps are left out"] += 1
+        model.warnings["normal maps are ignored"] += 1
     return Material(
         colour=tuple(colour[:3]),
         alpha=1.0 if mode == "OPAQUE" else colour[3],
@@ -182,7 +182,7 @@ def _gltf_material(data: dict[str, Any], model: Model) -> Material:
 
 
 def _images(material: Material, loaded: Any) -> None:
-    """The images that trimesh has read for a material."""
+    """Copy the images that trimesh has loaded to a material."""
     material.image, material.rough_image = loaded.baseColorTexture, loaded.metallicRoughnessTexture
     material.emission_image = loaded.emissiveTexture
     image = loaded.baseColorTexture
@@ -191,17 +191,17 @@ def _images(material: Material, loaded: Any) -> None:
 
 
 def _texture_transform(material: dict[str, Any], uv: np.ndarray) -> np.ndarray:
-    """KHR_texture_transform of the base colour, for all of the material's textures."""
-    places = (material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), material.get("emissiveTexture"))
-    texture: dict[str, Any] = next((p for p in places if p), {})
-    move = texture.get("extensions", {}).get("KHR_texture_transform", {})
-    angle = move.get("rotation", 0.0)
-    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    return uv * move.get("scale", [1, 1]) @ turn.T + move.get("offset", [0, 0])
+    """Apply the KHR_texture_transform of one texture, which all textures of the material then share."""
+    candidates = (material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), material.get("emissiveTexture"))
+    texture: dict[str, Any] = next((p for p in candidates if p), {})
+    transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    angle = transform.get("rotation", 0.0)
+    rotation_matrix = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return uv * transform.get("scale", [1, 1]) @ rotation_matrix.T + transform.get("offset", [0, 0])
 
 
 def _lamps(header: dict[str, Any], model: Model) -> None:
-    """KHR_lights_punctual, in the units of the emissive factors."""
+    """Add the lights of KHR_lights_punctual, in the units of the emissive factors."""
     lights = header.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
     for k, (node, matrix) in enumerate(_nodes(header)):
         index = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
@@ -210,16 +210,16 @@ def _lamps(header: dict[str, Any], model: Model) -> None:
         light = lights[index]
         kind, name = light.get("type"), node.get("name", light.get("name", f"light_{k}"))
         if kind == "directional":
-            model.warnings["a directional light has no surface and no sky: left out"] += 1
+            model.warnings["a directional light is ignored: nlt has only area lights and environments"] += 1
             continue
         if kind == "spot":
-            model.warnings["a spot light is taken as a point light"] += 1
+            model.warnings["a spot light is treated as a point light"] += 1
         intensity = light.get("intensity", 1.0) * np.array(light.get("color", [1.0, 1.0, 1.0]))
         model.lamps.append((name, matrix[:3, 3], intensity))
 
 
 def _nodes(header: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Every node of the default scene with its matrix (4, 4) to the world."""
+    """Yield every node of the default scene with its node-to-world matrix (4, 4)."""
     nodes = header.get("nodes", [])
     scenes = header.get("scenes") or [{"nodes": list(range(len(nodes)))}]
     waiting = [(k, np.eye(4)) for k in scenes[header.get("scene", 0)].get("nodes", [])]
@@ -237,26 +237,26 @@ def _nodes(header: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]
         waiting += [(child, parent @ local) for child in node.get("children", [])]
 
 
-# Wavefront OBJ is read here: trimesh joins all parts of one material and loses the texture coordinates of quads.
+# OBJ files are parsed here because trimesh joins all parts of one material and loses the texture coordinates of quads.
 _MAPS = ("map_kd", "map_d", "map_ke")
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    """The words of every line that has any; a backslash goes on with the next line."""
+    """Yield the words of every line that has any; a backslash at its end joins a line with the next."""
     text = path.read_text(errors="replace").replace("\\\n", " ")
     return (words for line in text.splitlines() if (words := line.split("#")[0].split()))
 
 
 def read_obj(path: Path) -> Model:
-    """A Wavefront OBJ file with its materials: a part per object or group and material.
+    """Read a Wavefront OBJ file and its materials, with one part per object or group and material.
 
     Raises:
-        UserError: a number or an index is broken.
+        UserError: a number or an index is invalid.
     """
     model, materials = Model(), dict[str, Material]()
     arrays: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     parts: dict[tuple[str, str], list[list[tuple[int, ...]]]] = {}
-    name, used = path.stem, ""
+    name, material_name = path.stem, ""
     try:
         for words in _lines(path):
             match words[0]:
@@ -265,24 +265,24 @@ def read_obj(path: Path) -> Model:
                 case "o" | "g" if len(words) > 1:
                     name = "_".join(words[1:])
                 case "usemtl":
-                    used = " ".join(words[1:])
+                    material_name = " ".join(words[1:])
                 case "mtllib":
                     materials |= _read_mtl(path.parent / " ".join(words[1:]), model)
                 case "f":
                     corners = [_corner(w, arrays) for w in words[1:]]
                     fan = [[corners[0], *corners[k : k + 2]] for k in range(1, len(corners) - 1)]
-                    parts.setdefault((name, used), []).extend(fan)
-        for (name, used), faces in parts.items():
-            if used not in materials:
-                model.warnings[f"material {used or '(none)'} is not in the MTL files: a grey one is taken"] += 1
-            model.parts.append((name, _triangles(faces, arrays), materials.get(used, Material())))
+                    parts.setdefault((name, material_name), []).extend(fan)
+        for (name, material_name), faces in parts.items():
+            if material_name not in materials:
+                model.warnings[f"material {material_name or '(none)'} is not in the MTL files: replaced by grey"] += 1
+            model.parts.append((name, _triangles(faces, arrays), materials.get(material_name, Material())))
     except (ValueError, IndexError) as error:
         raise UserError(f"{path}: not readable as OBJ: {error}") from None
     return model
 
 
 def _corner(word: str, arrays: dict[str, list[list[float]]]) -> tuple[int, ...]:
-    """Indices (v, vt, vn) from 0, -1 where there is none; negative ones in the file count from the end."""
+    """Return the indices (v, vt, vn) from 0, or -1 if absent. Negative indices in the file count from the end."""
     fields = [*word.split("/"), "", ""][:3]
     indices = []
     for text, array in zip(fields, arrays.values(), strict=True):
@@ -294,12 +294,12 @@ def _corner(word: str, arrays: dict[str, list[list[float]]]) -> tuple[int, ...]:
 def _triangles(faces: list[list[tuple[int, ...]]], arrays: dict[str, list[list[float]]]) -> Triangles:
     corners = np.array(faces).reshape(-1, 3)
     unique, inverse = np.unique(corners, axis=0, return_inverse=True)
-    given = [np.array([array[k] for k in unique[:, c]]) if (unique[:, c] >= 0).all() else None
+    attributes = [np.array([array[k] for k in unique[:, c]]) if (unique[:, c] >= 0).all() else None
              for c, array in enumerate(arrays.values())]  # fmt: skip
-    vertices, uv, normals = given
+    vertices, uv, normals = attributes
     if vertices is None:
         raise ValueError("a face without vertices")
-    # OBJ's v counts from the bottom row.
+    # In OBJ, v = 0 is the bottom row of an image.
     return Triangles(vertices, inverse.reshape(-1, 3), normals, None if uv is None else uv * [1, -1] + [0, 1])
 
 
@@ -311,8 +311,8 @@ def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
             raw[" ".join(words[1:])] = current = {}
         elif raw:
             current[words[0].lower()] = words[1:]
-    for name, said in raw.items():
-        number = lambda key, default, said=said: [float(w) for w in said.get(key, [])[:3] if _is_number(w)] or default
+    for name, data in raw.items():
+        number = lambda key, default, data=data: [float(w) for w in data.get(key, [])[:3] if _is_number(w)] or default
         opacity = number("d", [1 - number("tr", [0.0])[0]])[0]
         illumination, shininess = int(number("illum", [2])[0]), number("ns", [0.0])[0]
         shine = max(number("ks", [0.0]))
@@ -326,15 +326,15 @@ def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
             material.colour, material.metallic = tuple(number("ks", [1.0] * 3)), 1.0
             material.roughness = 0.0
         elif shine > 0.01 and shininess > 1:
-            material.roughness = float((2 / (shininess + 2)) ** 0.25)  # the same width of the highlight
+            material.roughness = float((2 / (shininess + 2)) ** 0.25)  # a highlight of the same width
         material.ior = material.ior if material.ior > 1.01 else 1.5
         material.emission = tuple(number("ke", [0.0] * 3))
         for key, attribute in (("map_kd", "image"), ("map_ke", "emission_image"), ("map_d", "alpha_image")):
-            if key in said:
-                image = Image.open(path.parent / said[key][-1].replace("\\", "/"))
+            if key in data:
+                image = Image.open(path.parent / data[key][-1].replace("\\", "/"))
                 setattr(material, attribute, image.convert("L") if key == "map_d" else image)
-        for key in set(said) & {"bump", "map_bump", "norm", "map_ks", "map_ns", "refl", "disp"}:
-            model.warnings[f"{key} of OBJ materials is left out"] += 1
+        for key in set(data) & {"bump", "map_bump", "norm", "map_ks", "map_ns", "refl", "disp"}:
+            model.warnings[f"{key} of OBJ materials is ignored"] += 1
         if material.image is not None:
             material.colour = (1.0, 1.0, 1.0)
         materials[name] = material

@@ -16,89 +16,89 @@ from nlt.scenes.masks import first_surface, is_mask, is_transparent
 from nlt.scenes.state import SceneState, rest_state
 from nlt.scenes.views import Views
 
-_EYES = 64
-_RECESS = 0.6  # metres
-_SURFACE = 1e-4  # of the way from an eye to a point: what is hit there is the point's own surface
-_MOST_CANDIDATES = 1000  # per point
+_EYES = 64  # random views that decide which points are visible
+_RECESS = 0.6  # metres; depth of a window's recess
+_SURFACE = 1e-4  # last fraction of the way to a point, in which a hit is the point's own surface
+_MOST_CANDIDATES = 1000  # at most, per requested point
 _BATCH = 1 << 20
 
 
 def sample_cdf(weights: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Discrete inverse transform sampling by bisection: indices with probability in proportion to `weights`."""
+    """Draw indices with probability proportional to `weights`, by inverse transform sampling of `uniform`."""
     cdf = np.cumsum(weights)
     return np.searchsorted(cdf, uniform * cdf[-1], side="right").clip(max=len(weights) - 1)
 
 
 def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
-    """The scene's points, every object in its place in the scene file: all fields of `POINT_FIELDS`.
+    """Sample the points of a scene at rest: all fields of `POINT_FIELDS`.
 
-    Points are uniform by area on what may come to be seen: on movable objects, and on what is in direct sight of one
-    of 64 random views while all movable objects are removed. (Glass is a surface, as in the G-buffer: it hides what is
-    behind it. The transparent parts of opacity masks have no points and hide nothing.) In a scene with a `room`,
-    nothing is further from it than 0.6 m, the depth of a window's recess.
+    Points are uniform by area on all surfaces that can become visible: movable objects, and surfaces in direct sight
+    of at least one of 64 random views while all movable objects are removed. Glass counts as a surface, as in the
+    G-buffer, and hides what is behind it. The transparent parts of opacity masks have no points and hide nothing. In a
+    scene with a `room`, no point is farther from it than 0.6 m, the depth of a window's recess.
 
     Raises:
-        UserError: less than a thousandth of the scene's surface is so.
+        UserError: less than a thousandth of the scene's surface can become visible.
     """
     rng = np.random.default_rng(seed)
     shapes = list(scene.shapes.values())
     owner = {name: k for k, movable in enumerate(scene.movables) for name in movable.shapes}
     owners = np.array([owner.get(shape.id, -1) for shape in shapes])
-    in_sight = _InSight(scene, rng.spawn(1)[0])
+    is_visible = _VisibilityTest(scene, rng.spawn(1)[0])
     kept: list[tuple[np.ndarray, ...]] = []
-    found = tried = 0
-    with scene.in_state(in_sight.state):
-        while found < count:
+    accepted = tried = 0
+    with scene.in_state(is_visible.state):
+        while accepted < count:
             if tried >= _MOST_CANDIDATES * count:
                 raise UserError(
-                    f"{scene.description.file}: camera: only {found} of {tried} points of the scene's surface can be "
-                    f"seen from it; move the box into the room, or take the surroundings out of the scene"
+                    f"{scene.description.file}: camera: only {accepted} of {tried} points of the scene's surface can "
+                    f"be seen from it; move the box into the room, or remove the surroundings from the scene"
                 )
-            width = min(int(1.1 * (count - found) * max(tried, 1) / max(found, 1)) + 64, _BATCH)
-            which, position, uv = uniform_points(shapes, width, rng)
+            width = min(int(1.1 * (count - accepted) * max(tried, 1) / max(accepted, 1)) + 64, _BATCH)
+            shape_index, position, uv = uniform_points(shapes, width, rng)
             if scene.masks:
-                solid = ~_transparent(shapes, which, uv)
-                which, position, uv = which[solid], position[solid], uv[solid]
-            seen = np.flatnonzero(in_sight(position, owners[which] >= 0))
-            kept.append((which[seen], position[seen], uv[seen]))
-            found, tried = found + len(seen), tried + width
-    which, position, uv = (np.concatenate(column)[:count] for column in zip(*kept, strict=True))
+                solid = ~_transparent(shapes, shape_index, uv)
+                shape_index, position, uv = shape_index[solid], position[solid], uv[solid]
+            seen = np.flatnonzero(is_visible(position, owners[shape_index] >= 0))
+            kept.append((shape_index[seen], position[seen], uv[seen]))
+            accepted, tried = accepted + len(seen), tried + width
+    shape_index, position, uv = (np.concatenate(column)[:count] for column in zip(*kept, strict=True))
     points: dict[str, np.ndarray] = {
         "position": position.astype(np.float32),
         "material": np.zeros(count, np.uint8),
         "albedo": np.zeros((count, 3), np.float32),
         "emission": np.zeros((count, 3), np.float32),
-        "shape": which.astype(np.int32),
-        "object": owners[which].astype(np.int32),
-        "area_share": np.array(found / tried, np.float32),
+        "shape": shape_index.astype(np.int32),
+        "object": owners[shape_index].astype(np.int32),
+        "area_share": np.array(accepted / tried, np.float32),
     }
-    for k in np.unique(which):
-        mine = which == k
-        points["material"][mine] = MATERIALS.index(material(shapes[k].bsdf))
-        points["albedo"][mine], points["emission"][mine] = surface(shapes[k], uv[mine])
+    for k in np.unique(shape_index):
+        rows = shape_index == k
+        points["material"][rows] = MATERIALS.index(material(shapes[k].bsdf))
+        points["albedo"][rows], points["emission"][rows] = surface(shapes[k], uv[rows])
     return points
 
 
 def uniform_points(shapes: list[Shape], count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Points uniform by area: shape (count,), position (count, 3) in metres, texture coordinates (count, 2).
+    """Sample points uniformly by area: shape (count,), position (count, 3) in metres, texture coordinates (count, 2).
 
-    Shapes are drawn by area, then triangles by area, then a uniform point in the triangle.
+    A shape is drawn by area, then one of its triangles by area, then a uniform point in the triangle.
     """
     areas = [shape.face_areas for shape in shapes]
-    which = sample_cdf(np.array([a.sum() for a in areas]), rng.random(count))
+    shape_index = sample_cdf(np.array([a.sum() for a in areas]), rng.random(count))
     position, uv = np.zeros((count, 3)), np.zeros((count, 2))
-    for k in np.unique(which):
-        shape, mine = shapes[k], np.flatnonzero(which == k)
-        triangle = shape.faces[sample_cdf(areas[k], rng.random(len(mine)))]
-        weights = _barycentric(rng.random((len(mine), 2)))
-        position[mine] = np.einsum("nk,nkd->nd", weights, shape.vertices[triangle])
+    for k in np.unique(shape_index):
+        shape, rows = shapes[k], np.flatnonzero(shape_index == k)
+        triangle = shape.faces[sample_cdf(areas[k], rng.random(len(rows)))]
+        weights = _barycentric(rng.random((len(rows), 2)))
+        position[rows] = np.einsum("nk,nkd->nd", weights, shape.vertices[triangle])
         if shape.uv is not None:
-            uv[mine] = np.einsum("nk,nkd->nd", weights, shape.uv[triangle])
-    return which, position, uv
+            uv[rows] = np.einsum("nk,nkd->nd", weights, shape.uv[triangle])
+    return shape_index, position, uv
 
 
-class _InSight:
-    """Which points may come to be seen. To be asked while the scene is in `state`, without its movable objects."""
+class _VisibilityTest:
+    """Tests which points can become visible. Call it while the scene is in `state`, without its movable objects."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -107,10 +107,10 @@ class _InSight:
         views = Views(scene)
         with scene.in_state(self.state):
             self.eyes = [views.sample(1, rng).position for _ in range(_EYES)]
-        self._clear = freeze(_clear)
+        self._unoccluded = freeze(_unoccluded)
 
     def __call__(self, position: np.ndarray, movable: np.ndarray) -> np.ndarray:
-        """(n,) bool of positions (n, 3) in metres that lie on movable objects or not (n,)."""
+        """Return (n,) bool for positions (n, 3) in metres; `movable` (n,) marks points on movable objects."""
         room, units = self.scene.description.room, self.scene.description.units_per_metre
         outside = np.zeros(len(position), bool)
         if room is not None:
@@ -123,11 +123,11 @@ class _InSight:
                     "origin": ("Point3f", np.tile(eye * units, (len(rows), 1))),
                     "reach": ("Vector3f", (position[rows] - eye) * units),
                 }
-                seen[rows] = launch(self._clear, lanes, scene=self.scene.mi_scene, masks=self.scene.masks)[0]
+                seen[rows] = launch(self._unoccluded, lanes, scene=self.scene.mi_scene, masks=self.scene.masks)[0]
         return seen
 
 
-def _clear(scene: Any, masks: bool, origin: Any, reach: Any) -> tuple:
+def _unoccluded(scene: Any, masks: bool, origin: Any, reach: Any) -> tuple:
     ray = mi.Ray3f(origin, reach)
     if masks:
         return (first_surface(scene, ray, masks).t > 1 - _SURFACE,)
@@ -135,28 +135,28 @@ def _clear(scene: Any, masks: bool, origin: Any, reach: Any) -> tuple:
     return (~scene.ray_test(ray) if is_jit() else not scene.ray_test(ray),)
 
 
-def _transparent(shapes: list[Shape], which: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(n,) bool: points at texture coordinates uv (n, 2) of shapes which (n,) lie on a transparent part of a mask."""
-    transparent = np.zeros(len(which), bool)
-    for k in np.unique(which):
-        bsdf, mine = shapes[k].bsdf, which == k
+def _transparent(shapes: list[Shape], shape_index: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: whether each point, at `uv` (n, 2), lies on a transparent part of a mask."""
+    transparent = np.zeros(len(shape_index), bool)
+    for k in np.unique(shape_index):
+        bsdf, rows = shapes[k].bsdf, shape_index == k
         if is_mask(bsdf):
             kernel = lambda uv, bsdf=bsdf: (is_transparent(bsdf, _interaction(uv)),)
-            (transparent[mine],) = launch(kernel, {"uv": ("Point2f", uv[mine])})
+            (transparent[rows],) = launch(kernel, {"uv": ("Point2f", uv[rows])})
     return transparent
 
 
 def _barycentric(uniform: np.ndarray) -> np.ndarray:
-    """(n, 3) weights of a point uniform in a triangle."""
+    """Barycentric weights (n, 3) of uniform points in a triangle."""
     root = np.sqrt(uniform[:, 0])
     return np.stack([1 - root, root * (1 - uniform[:, 1]), root * uniform[:, 1]], axis=1)
 
 
 def material(bsdf: Any) -> str:
-    """The entry of `MATERIALS` that describes a BSDF's lobes (opacity masks count as what they mask)."""
+    """Return the entry of `MATERIALS` for the lobes of a BSDF; an opacity mask counts as the BSDF inside it."""
     flags = int(bsdf.flags())
     has = lambda *names: any(flags & int(getattr(mi.BSDFFlags, name)) for name in names)
-    # Thin glass lets light through unbent, and its flags say what those of a mirror behind an opacity mask say.
+    # The flags of thin glass equal those of a mirror inside an opacity mask.
     if has("DeltaTransmission", "GlossyTransmission") or bsdf.class_name() == "ThinDielectric":
         return "glass"
     specular = has("GlossyReflection", "DeltaReflection")
@@ -168,10 +168,9 @@ def material(bsdf: Any) -> str:
 
 
 def diffuse_albedo(bsdf: Any, interaction: Any, active: Any = True) -> Any:
-    """Diffuse reflectance in [0, 1]: zero for BSDFs without a diffuse lobe.
+    """Return the diffuse reflectance in [0, 1]; it is zero for BSDFs without a diffuse lobe, like mirrors and glass.
 
-    Mitsuba's default answers with the BSDF's value there, which for a conductor can be 18: a mirror or a
-    glass has no diffuse reflectance, so its albedo is black.
+    For those, Mitsuba's default returns the value of the BSDF, which can be 18 for a conductor.
     """
     diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
     value = mi.Color3f(bsdf.eval_diffuse_reflectance(interaction, active))
@@ -179,7 +178,7 @@ def diffuse_albedo(bsdf: Any, interaction: Any, active: Any = True) -> Any:
 
 
 def surface(shape: Shape, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo and emitted radiance (n, 3) at texture coordinates (n, 2) of a shape."""
+    """Return the albedo (n, 3) and the emitted radiance (n, 3) at texture coordinates `uv` (n, 2) of a shape."""
 
     def kernel(uv: Any) -> tuple:
         interaction = _interaction(uv)

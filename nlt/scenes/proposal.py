@@ -1,7 +1,7 @@
-"""A first guess at a description of a new scene: room, units, camera volume, movable objects, moving light.
+"""Propose a description of a new scene: room, units, camera volume, movable objects, moving light.
 
-Everything is measured: rays find floor, ceiling and free space; shapes that touch are one object. Lengths are in the
-scene's own units; `h` below stands for the height of the room, 2.7 m in a usual one.
+All values are measured: rays find the floor, the ceiling and free space, and shapes that touch form one object. Lengths
+are in scene units. In the comments below, `h` is the height of the room, usually 2.7 m.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from nlt.scenes.description import Movable, MovingLight
 from nlt.scenes.lanes import launch
 
 UNITS = {"metres": 1.0, "decimetres": 10.0, "centimetres": 100.0, "millimetres": 1000.0, "inches": 39.37, "feet": 3.281}
-_HEIGHT = 2.7  # metres: a usual room
-_TOUCH = 1 / 135  # of h: shapes this near touch (2 cm)
-_LARGE = 0.65  # of the room along an axis: longer things are its walls and built-in furniture
-_SMALL = 1 / 25  # of h: smaller things are handles and screws (11 cm)
-_REACH = 0.75  # of h: an object moves no farther than this (2 m)
+_HEIGHT = 2.7  # metres; the height of a usual room
+_TOUCH = 1 / 135  # of h: shapes closer than this touch (2 cm)
+_LARGE = 0.65  # of the room along an axis: longer shapes are walls and built-in furniture
+_SMALL = 1 / 25  # of h: smaller shapes are handles and screws (11 cm)
+_REACH = 0.75  # of h: the largest translation of an object (2 m)
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """What `scene.yaml` could say, lengths in scene units; boxes are (2, 3). `because` gives the reasons of guesses."""
+    """Content of a `scene.yaml`, lengths in scene units; boxes are (2, 3). `because` holds reasons for guesses."""
 
     up: str
     units_per_metre: float
@@ -42,26 +42,26 @@ class Proposal:
 
 
 def propose(scene: Any, shapes: Mapping[str, Shape], up: str | None) -> Proposal:
-    """Guess a description of a loaded scene; `up` is the file's own word, None where it has none."""
+    """Propose a description of a loaded scene; `up` is the axis that the file states, or None."""
     because = {}
     bounds = _box(np.concatenate([_box(s.vertices) for s in shapes.values()]))
     if up is None:
-        up, because["up"] = _guess_up(shapes), "most of the area that faces along an axis faces along this one"
+        up, because["up"] = _guess_up(shapes), "most of the area that faces along an axis faces along this axis"
     else:
-        because["up"] = "the file says so"
+        because["up"] = "stated in the file"
     axis = "xyz".index(up)
     room, because["room"] = _room(scene, shapes, bounds, axis)
     height = room[1, axis] - room[0, axis]
     unit = min(UNITS, key=lambda u: abs(np.log(height / UNITS[u] / _HEIGHT)))
     because["units_per_metre"] = (
-        f"a guess: the room is {height:.4g} high, which is {height / UNITS[unit]:.2f} m in {unit}"
+        f"a guess: the room is {height:.4g} high, which is {height / UNITS[unit]:.2f} m if its units are {unit}"
     )
     rng = np.random.default_rng(0)
     points = {name: _surface_points(shape, _TOUCH * height / 2, rng) for name, shape in shapes.items()}
     objects = []
     for names, box in _movable(scene, points, room, axis):
         if all(shapes[n].emitter is not None for n in names):
-            continue  # a window's light belongs to the window
+            continue  # the light of a window moves only with the window
         largest = max(names, key=lambda n: float(np.prod(np.ptp(_box(points[n]), axis=0) + _TOUCH * height)))
         objects.append(Movable(largest, tuple(names), box))
     camera, because["camera"] = _camera(scene, room, axis)
@@ -73,7 +73,7 @@ def _box(points: np.ndarray) -> np.ndarray:
 
 
 def _guess_up(shapes: Mapping[str, Shape]) -> str:
-    """The axis along which most area faces: floors and ceilings; y where two axes tie."""
+    """Return the axis that most area faces, like floors and ceilings; y if two axes tie."""
     area = np.zeros(3)
     for shape in shapes.values():
         a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
@@ -85,7 +85,7 @@ def _guess_up(shapes: Mapping[str, Shape]) -> str:
 
 
 def trace(scene: Any, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Distances (n,) to the first hits; inf where there is none."""
+    """Return the distances (n,) to the first hits, inf for rays that hit nothing."""
 
     def kernel(origin: Any, direction: Any) -> tuple:
         return (scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))).t,)
@@ -95,13 +95,13 @@ def trace(scene: Any, origins: np.ndarray, directions: np.ndarray) -> np.ndarray
 
 
 def _grid(box: np.ndarray, counts: tuple[int, int, int]) -> np.ndarray:
-    """(n, 3) cell centres."""
+    """Cell centres (n, 3) of a regular grid in a box."""
     axes = [box[0, k] + (box[1, k] - box[0, k]) * (np.arange(n) + 0.5) / n for k, n in enumerate(counts)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
-    """The highest or lowest height at which at least a seventh of all rays end."""
+    """Return the highest or lowest height at which at least a seventh of all rays end."""
     heights = np.sort(heights)
     counts = np.searchsorted(heights, heights + tolerance) - np.arange(len(heights))
     busy = heights[counts >= max(len(heights) / 7, 1)]
@@ -110,7 +110,7 @@ def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
 
 
 def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
-    """The inside of the room: floor and ceiling where vertical rays end, walls where horizontal ones do."""
+    """Measure the inside of the room: vertical rays end at floor and ceiling, horizontal rays at the walls."""
     size, across = np.ptp(bounds, axis=0), [k for k in range(3) if k != axis]
     boxes = np.stack([_box(s.vertices) for s in shapes.values()])
     small = (np.ptp(boxes, axis=1) < 0.4 * size.max()).all(1)
@@ -120,7 +120,7 @@ def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int
     room, ended = bounds.astype(float).copy(), np.zeros((2, 3), bool)
 
     def measure(inside: np.ndarray, axes: list[int], layers: int, tolerance: float) -> None:
-        """The room's sides across `axes`, by rays from all over a box, where enough of them end."""
+        """Set the sides of the room across `axes` if enough of the rays that start all over a box end there."""
         counts = [24, 24, 24]
         counts[axis] = layers
         starts = _grid(inside, (counts[0], counts[1], counts[2]))
@@ -140,7 +140,8 @@ def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int
     between[:, axis] = room[0, axis] + height * np.array([0.55, 0.9])
     measure(between, across, 4, 0.02)
     outward = np.array([[-1], [1]])
-    # Few things may all stand on one table: once more from wherever the walls let, for what is far from that.
+    # If all contents stand on one table, the rays end on it. Measure again from the whole area between the walls, and
+    # keep the new height if it differs clearly.
     before = room[:, axis].copy()
     middle[:, across] = np.where(ended, room - 0.05 * outward * size, contents)[:, across]
     measure(middle, [axis], 3, 0.01)
@@ -150,28 +151,28 @@ def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int
     names = [[f"{sign}{letter} wall" for letter in "xyz"] for sign in "-+"]
     names[0][axis], names[1][axis] = "floor", "ceiling"
     open_sides = [names[side][k] for k in (axis, *across) for side in (0, 1) if not ended[side, k]]
-    said = "where rays from its middle end"
-    return room, said + (f"; none end at the {', '.join(open_sides)}" if open_sides else "")
+    reason = "where rays from the middle end"
+    return room, reason + (f"; no rays end at the {', '.join(open_sides)}" if open_sides else "")
 
 
 def _surface_points(shape: Shape, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """The shape's vertices and points spread over its area."""
+    """Return the shape's vertices and random points on its surface."""
     areas = shape.face_areas
     count = int(np.clip(areas.sum() / spacing**2, 30, 20000))
     cdf = np.cumsum(areas)
-    which = np.searchsorted(cdf, rng.random(count) * cdf[-1]).clip(max=len(areas) - 1)
+    triangle = np.searchsorted(cdf, rng.random(count) * cdf[-1]).clip(max=len(areas) - 1)
     root, other = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
-    a, b, c = (shape.vertices[shape.faces[which, k]] for k in range(3))
+    a, b, c = (shape.vertices[shape.faces[triangle, k]] for k in range(3))
     return np.concatenate([shape.vertices, (1 - root) * a + root * (1 - other) * b + root * other * c])
 
 
 def _movable(
     scene: Any, points: Mapping[str, np.ndarray], room: np.ndarray, axis: int
 ) -> list[tuple[list[str], np.ndarray]]:
-    """Groups of shapes that touch, each with its box of translations, the largest first.
+    """Return groups of shapes that touch, each with its box of translations, the largest first.
 
-    A group as long as the room, or that nothing carries, or that is stuck at a wall, is built in: it loses its largest
-    shape, and what is left is grouped anew.
+    A group is built in if it is as long as the room, if nothing carries it, or if it cannot move away from a wall. It
+    then loses its largest shape, and the remaining shapes are grouped again.
     """
     height, size = room[1, axis] - room[0, axis], np.ptp(room, axis=0)
     level = np.arange(3) != axis
@@ -180,24 +181,24 @@ def _movable(
     volume = lambda names: float(np.prod(np.ptp(around(names), axis=0) + _TOUCH * height))
     too_long = lambda names: bool((np.ptp(around(names), axis=0) > _LARGE * size)[level].any())
     near = room + 0.1 * height * np.array([[-1], [1]])
-    left = [n for n, b in boxes.items() if _within(b.mean(0), near) and not too_long([n])]
-    done: list[tuple[list[str], np.ndarray]] = []
-    while left:
-        labels = _touching([points[n] for n in left], _TOUCH * height)
-        groups = [[n for n, mine in zip(left, labels, strict=True) if mine == k] for k in np.unique(labels)]
-        left = []
+    pending = [n for n, b in boxes.items() if _within(b.mean(0), near) and not too_long([n])]
+    movable: list[tuple[list[str], np.ndarray]] = []
+    while pending:
+        labels = _touching([points[n] for n in pending], _TOUCH * height)
+        groups = [[n for n, label in zip(pending, labels, strict=True) if label == k] for k in np.unique(labels)]
+        pending = []
         for names in _stacked(groups, around, too_long, height, axis):
             if np.ptp(around(names), axis=0).max() < _SMALL * height:
                 continue
             moves = None if too_long(names) else _translations(scene, points, names, room, axis)
             if moves is not None and np.ptp(moves, axis=0).max() > 0.02 * height:
-                done.append((names, moves))
+                movable.append((names, moves))
                 continue
             box = around(names)
             at_wall = bool((np.abs(box - room) < 0.03 * height)[:, level].any())
             if len(names) > 1 and (moves is None or at_wall):
-                left += sorted(set(names) - {max(names, key=lambda n: volume([n]))})
-    return sorted(done, key=lambda found: -volume(found[0]))
+                pending += sorted(set(names) - {max(names, key=lambda n: volume([n]))})
+    return sorted(movable, key=lambda entry: -volume(entry[0]))
 
 
 def _within(point: np.ndarray, box: np.ndarray) -> bool:
@@ -211,7 +212,7 @@ def _stacked(
     height: float,
     axis: int,
 ) -> list[list[str]]:
-    """Groups whose boxes lie in each other, or one just on top of the other, joined: a table's top and its frame."""
+    """Join groups if one box lies in the other or directly on top of it, like a table's top on its frame."""
     groups = sorted(groups, key=lambda names: -float(np.prod(np.ptp(around(names), axis=0) + _TOUCH * height)))
     joined: list[list[str]] = []
     for names in groups:
@@ -232,17 +233,17 @@ def _stacked(
 
 
 def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
-    """Labels (n,) of the clouds' connected groups: two clouds touch where they have points in one cell of a grid."""
+    """Label connected clouds (n,): two clouds touch if they have points in the same cell of a grid."""
     owner = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-    every = np.concatenate(clouds)
+    points = np.concatenate(clouds)
     pairs = []
     for shift in (0.0, 0.5):
-        cells = np.floor(every / distance + shift).astype(np.int64)
+        cells = np.floor(points / distance + shift).astype(np.int64)
         cells -= cells.min(0)
-        place = np.ravel_multi_index(cells.T, tuple(cells.max(0) + 1))
-        cell, mine = np.divmod(np.unique(place * len(clouds) + owner), len(clouds))
+        flat_cell = np.ravel_multi_index(cells.T, tuple(cells.max(0) + 1))
+        cell, cloud = np.divmod(np.unique(flat_cell * len(clouds) + owner), len(clouds))
         same = cell[1:] == cell[:-1]
-        pairs.append(np.column_stack([mine[:-1][same], mine[1:][same]]))
+        pairs.append(np.column_stack([cloud[:-1][same], cloud[1:][same]]))
     first, second = np.concatenate(pairs).T
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(clouds), len(clouds)))
     return connected_components(graph, directed=False)[1]
@@ -251,9 +252,9 @@ def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
 def _translations(
     scene: Any, points: Mapping[str, np.ndarray], names: list[str], room: np.ndarray, axis: int
 ) -> np.ndarray | None:
-    """(2, 3) where a group can slide: over what it stands on, along the wall or ceiling it hangs on, clear of all else.
+    """Return the translations (2, 3) by which a group can slide over its support, or along its wall or ceiling.
 
-    None if nothing carries it.
+    The group collides with nothing there. None if nothing carries it.
     """
     height = room[1, axis] - room[0, axis]
     cell, reach = height / 100, _REACH * height
@@ -284,7 +285,7 @@ def _translations(
     under, ring = np.zeros(shape, bool), np.zeros(shape, bool)
     under[r0 : r1 + 1, c0 : c1 + 1] = True
     ring[max(r0 - 2, 0) : r1 + 3, max(c0 - 2, 0) : c1 + 3] = True
-    ring &= ~under & ~outside  # just around its feet: below them, rays would meet itself
+    ring &= ~under & ~outside  # only around its feet: under them, rays would hit the group itself
     result = np.zeros((2, 3))
     blocked[first[0] : last[0] + 1, first[1] : last[1] + 1] = False
     if ring.any() and carried[ring].mean() > 0.5:
@@ -300,7 +301,7 @@ def _translations(
     gaps = np.abs(box[:, thin] - room[:, thin])
     if box[1, thin] - box[0, thin] > 0.1 * height or gaps.min() > 0.06 * height:
         return None
-    # It hangs on a wall: what is level with its front, or a little before it, stops it.
+    # It hangs on a wall: points level with its front, or slightly before it, block it.
     side = int(gaps.argmin() == 0)
     sign = 1 if side else -1
     stop = np.zeros((shape[(b, c).index(along)], 1), bool)
@@ -321,24 +322,24 @@ def _translations(
 
 
 def _grow(blocked: np.ndarray, first: np.ndarray, last: np.ndarray, most: int) -> np.ndarray:
-    """How many cells (2, 2) a rectangle can be stretched to each side without meeting a blocked one."""
+    """Return by how many cells (2, 2) a rectangle can grow to each side without reaching a blocked cell."""
     steps = np.zeros((2, 2), int)
-    going = [(side, k) for k in (0, 1) for side in (0, 1)]
-    while going:
-        for side, k in list(going):
+    growing = [(side, k) for k in (0, 1) for side in (0, 1)]
+    while growing:
+        for side, k in list(growing):
             trial = steps.copy()
             trial[side, k] += 1 if side else -1
             (r0, c0), (r1, c1) = first + trial[0], last + trial[1]
             inside = r0 >= 0 and c0 >= 0 and r1 < blocked.shape[0] and c1 < blocked.shape[1]
             if abs(trial[side, k]) > most or not inside or blocked[r0 : r1 + 1, c0 : c1 + 1].any():
-                going.remove((side, k))
+                growing.remove((side, k))
             else:
                 steps = trial
     return steps
 
 
 def _camera(scene: Any, room: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
-    """A large box of eye heights in which most points are free: nothing within a tenth of the room's height."""
+    """Find a large box at eye height in which most points are free: nothing within a tenth of the room's height."""
     height = room[1, axis] - room[0, axis]
     box = room + 0.1 * height * np.array([[1], [-1]])
     box[:, axis] = room[0, axis] + height * np.array([0.3, 0.75])
@@ -354,7 +355,7 @@ def _camera(scene: Any, room: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
         part = free[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
         if part.mean() >= 0.9 or max(part.shape) == 1:
             break
-        # Drop the outermost layer with the least free space, of the longer side where layers tie.
+        # Drop the outermost layer with the least free space; if layers tie, the one of the longer axis.
         layers = [(part.take(-side, k).mean(), -part.shape[k], k, side) for k in range(3) for side in (0, 1)]
         _, _, k, side = min(layer for layer in layers if part.shape[layer[2]] > 1)
         low[k] += side == 0
@@ -364,7 +365,7 @@ def _camera(scene: Any, room: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
 
 
 def _light(room: np.ndarray, axis: int) -> MovingLight:
-    """Under the ceiling's middle, as large as a quarter of its sides."""
+    """Place a light under the middle of the ceiling, with a quarter of its width and length."""
     level = [k for k in range(3) if k != axis]
     size = np.ptp(room, axis=0)
     box = np.stack([room.mean(0), room.mean(0)])

@@ -1,4 +1,4 @@
-"""Which files a scene file is made of; no renderer needed."""
+"""List the files that a scene consists of. Needs no renderer."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from nlt.scenes import mitsuba_xml
 
 
 def scene_files(path: Path) -> list[Path]:
-    """The file and every file that it names and that is there: meshes, images, includes."""
+    """Return the scene file and every existing file that it refers to: meshes, images, includes."""
     if path.suffix.lower() == ".xml":
         return sorted(set(mitsuba_xml.read(path).files))
-    from nlt.scenes.model import named_files  # here: it imports trimesh, which most scenes do not need
+    from nlt.scenes.model import named_files  # imported here because most scenes do not need trimesh
 
     return sorted({path, *(f for name in named_files(path) if (f := path.parent / name).is_file())})

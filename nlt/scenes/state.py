@@ -1,4 +1,4 @@
-"""States of a scene and views of it, sampled as the supplementary says (Scene Modification, View Sampling)."""
+"""Sample states and views of a scene as in the supplementary (Scene Modification, View Sampling)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ REMOVAL_PROBABILITY = 0.2
 
 @dataclass(frozen=True)
 class SceneState:
-    """Where each of the M movable objects is.
+    """The translation and presence of each of the M movable objects.
 
     Attributes:
-        translation: (M, 3) float32, metres, from the place in the scene file; zero for a removed object.
+        translation: (M, 3) float32, metres, relative to the position in the scene file; zero for a removed object.
         present: (M,) bool.
     """
 
@@ -26,18 +26,18 @@ class SceneState:
 
     @property
     def key(self) -> bytes:
-        """Equal for equal states."""
+        """Bytes that are equal for equal states."""
         return self.translation.tobytes() + self.present.tobytes()
 
 
 def rest_state(description: SceneDescription, experiment: str) -> SceneState:
-    """Every object present, in its place in the scene file."""
+    """The state in which every object is present, at its position in the scene file."""
     count = len(description.movables(experiment))
     return SceneState(np.zeros((count, 3), np.float32), np.ones(count, bool))
 
 
 def sample_state(description: SceneDescription, experiment: str, rng: np.random.Generator) -> SceneState:
-    """A translation per movable object uniform in its box; each object removed with probability 0.2."""
+    """Sample a state: translations are uniform in the objects' boxes; objects are removed with probability 0.2."""
     movables = description.movables(experiment)
     if not movables:
         return rest_state(description, experiment)
@@ -49,11 +49,11 @@ def sample_state(description: SceneDescription, experiment: str, rng: np.random.
 
 
 def sample_view(description: SceneDescription, resolution: int, rng: np.random.Generator) -> Camera:
-    """A position uniform in the camera box, looking at a point uniform in a box half its size."""
+    """Sample a view: the position is uniform in the box `camera`, the target uniform in the box `look_at`."""
     while True:
         position, target = rng.uniform(*description.camera), rng.uniform(*description.look_at)
         direction = target - position
         sine = np.linalg.norm(np.cross(direction, description.up))
-        # A view straight up or down has no horizon, and one of zero length no direction: draw again.
+        # Draw again if the view is vertical or has zero length, because its orientation is then undefined.
         if sine > 1e-3 * np.linalg.norm(direction):
             return Camera.look_at(position, target, description.up, description.fov, resolution, resolution)

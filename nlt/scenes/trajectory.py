@@ -1,4 +1,4 @@
-"""What a video shows: a state and a view for each of its frames, from a few keys or by themselves."""
+"""The states and cameras of the frames of a video, from a few keyframes or a turntable."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nlt.scenes.description import MOVING_LIGHT, SceneDescription, Section
 from nlt.scenes.state import SceneState, rest_state, sample_state
 
 TURNTABLE = "turntable"
-_INNER = 0.9  # of a box's half size: how far a turntable goes
+_INNER = 0.9  # radius of a turntable, as a fraction of the box's half size
 
 
 def turn(box: np.ndarray, up: np.ndarray, frames: int, phase: float = 0.0) -> np.ndarray:
-    """(frames, 3): once around in a box (2, 3), at half its height; begins `phase` (in turns) further."""
+    """Points (frames, 3) of a horizontal ellipse in a box (2, 3), at half its height; `phase` is the start in turns."""
     angle = 2 * np.pi * (np.arange(frames) / frames + phase)
     first, second = np.flatnonzero(up == 0)
     around = np.zeros((frames, 3))
@@ -29,9 +29,10 @@ def turn(box: np.ndarray, up: np.ndarray, frames: int, phase: float = 0.0) -> np
 
 
 def follow(keys: np.ndarray, frames: int, closed: bool) -> np.ndarray:
-    """(frames, 3): from the first to the last of keys (K, 3), or, closed, back to the first.
+    """Interpolate keys (K, 3) to points (frames, 3), from the first to the last key or, if `closed`, back to the first.
 
-    Cubic and smooth, and never outside of the box of two neighbouring keys: a spline that overshoots leaves the room.
+    The cubic curve is smooth and stays in the bounding box of neighbouring keys. One that overshoots would leave the
+    room.
     """
     count = len(keys)
     if count == 1:
@@ -43,12 +44,14 @@ def follow(keys: np.ndarray, frames: int, closed: bool) -> np.ndarray:
 
 
 def cameras(description: SceneDescription, path: str, frames: int, width: int, height: int) -> list[Camera]:
-    """The views of a video: `path` is turntable, or a YAML or JSON file with `views`, each a position and a target.
+    """Return the cameras of a video.
 
-    Lengths are metres. The turntable goes around in the box of the scene's cameras and looks across it.
+    Args:
+        path: "turntable", which circles in the scene's camera box and looks across it; or a YAML or JSON file of
+            `views`, each with a position and a target in metres.
 
     Raises:
-        UserError: the file is missing, or a key of it is, is unknown or is no point.
+        UserError: the file is missing, or one of its keys is missing, unknown or not a point.
     """
     fov = description.fov
     if path == TURNTABLE:
@@ -58,15 +61,15 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
         section = _read(path, ("views", "closed", "fov"))
         views, closed = section.get("views"), section.flag("closed")
         if not isinstance(views, list) or not views:
-            raise UserError(f"{path}: views: must be a list of a position and a target each, is {views!r}")
+            raise UserError(f"{path}: views: must be a list of mappings with a position and a target, is {views!r}")
         keys = [Section(Path(path), f"views[{k}]", view, ("position", "target")) for k, view in enumerate(views)]
         ends = ("position", "target")
         positions, targets = (follow(np.stack([k.numbers(end, (3,)) for k in keys]), frames, closed) for end in ends)
         fov = section.degrees("fov", default=fov)
     for k, (position, target) in enumerate(zip(positions, targets, strict=True)):
-        away = target - position
-        if np.linalg.norm(np.cross(away, description.up)) <= 1e-3 * np.linalg.norm(away):
-            raise UserError(f"--camera-path: {path}: frame {k} looks straight up or down, or nowhere; move its target")
+        direction = target - position
+        if np.linalg.norm(np.cross(direction, description.up)) <= 1e-3 * np.linalg.norm(direction):
+            raise UserError(f"--camera-path: {path}: frame {k} looks straight up or down, or nowhere; move the target")
     up = description.up
     return [Camera.look_at(p, t, up, fov, width, height) for p, t in zip(positions, targets, strict=True)]
 
@@ -74,16 +77,16 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
 def states(
     description: SceneDescription, experiment: str, state: str, light: str | None, frames: int
 ) -> list[SceneState]:
-    """The states of a video, in which the light alone moves.
+    """Return the states of a video, in which only the light moves.
 
     Args:
-        state: the number of a random state; or a YAML file: `seed`, a random state to begin with (default: every
-            object in its place), `objects`, of which each is "removed" or a translation from that place, and `light`,
-            the positions that its centre passes. Lengths are metres.
-        light: turntable, around in the box of its positions; None for what the file says, or for a light that rests.
+        state: the seed of a random state; or a YAML file with `seed`, the random state to start from (default: every
+            object at rest), `objects`, each either "removed" or a translation from rest, and `light`, the keyframes
+            of the light's centre. Lengths are in metres.
+        light: "turntable" to circle in the box of the light's positions; None to follow the file's `light`, if any.
 
     Raises:
-        UserError: the file is missing or says what is no state of this scene and experiment.
+        UserError: the file is missing, or does not describe a state of this scene and experiment.
     """
     movables = description.movables(experiment)
     names = [movable.name for movable in movables]
@@ -94,7 +97,7 @@ def states(
     moving = description.light
     if moving is None or MOVING_LIGHT not in names:
         if light or keys is not None:
-            raise UserError(f"--light: {description.name} has no light that moves in the experiment {experiment}")
+            raise UserError(f"--light: {description.name} has no moving light in the experiment {experiment}")
         return [base] * frames
     if light:
         positions = turn(moving.box, description.up, frames)
@@ -103,12 +106,12 @@ def states(
     else:
         return [base] * frames
     row = names.index(MOVING_LIGHT)
-    found = []
+    moved = []
     for position in positions:
         translation = base.translation.copy()
         translation[row] = position - moving.centre
-        found.append(replace(base, translation=translation))
-    return found
+        moved.append(replace(base, translation=translation))
+    return moved
 
 
 def _read_state(
@@ -134,7 +137,7 @@ def _read_state(
 
 
 def _read(path: str, known: tuple[str, ...]) -> Section:
-    """A YAML or JSON file: JSON is YAML."""
+    """Read a YAML or JSON file (JSON is valid YAML)."""
     try:
         data: Any = yaml.safe_load(Path(path).read_text())
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Views that show the room: none from behind a wall, from inside a closed object or with something before the lens."""
+"""Sample views that show the room: not from behind a wall, from inside a closed object or with a blocked lens."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from nlt.scenes.camera import Camera
 from nlt.scenes.lanes import freeze, is_jit, launch
 from nlt.scenes.state import rest_state, sample_view
 
-_RAYS = 256  # around the camera, and as many through the image
+_RAYS = 256  # around the camera, and the same number through the image
 _NEAR = 0.2  # metres
-_PROBES = 16  # views that find out which shapes are inside out
+_PROBES = 16  # camera positions that reveal which shapes are inside out
 _TRIES = 100
-# Between what was measured in the six real rooms, of which tests/test_real_scenes.py measures less. Of 900 views from
-# the camera boxes, 98 % pass: back is below 0.2 and nothing below 0.42 in 99 %, near is 0 in 95 %. Of 381 views from
-# inside closed meshes none passes: back is above 0.46 in 99 %. Of 430 views from outside the rooms 3 % pass, most of
-# which stand in the recess of a window.
-_MOST = {"back": 0.3, "near": 0.3, "nothing": 0.5}
+# Thresholds that separate good from bad views in the six real rooms (tests/test_real_scenes.py repeats a part). Of 900
+# views from the camera boxes, 98% pass: in 99%, back is below 0.2 and nothing below 0.42; in 95%, near is 0. Of 381
+# views from inside closed meshes, none passes: in 99%, back is above 0.46. Of 430 views from outside the rooms, 3%
+# pass, most of them from the recess of a window.
+_LIMITS = {"back": 0.3, "near": 0.3, "nothing": 0.5}
 
 
 class Shares(NamedTuple):
-    """Of a view's rays. `back` and `nothing` are the larger of the shares around the camera and through the image."""
+    """Shares of a view's rays. `back` and `nothing` are the larger share of: around the camera, through the image."""
 
-    back: float  # meet a surface from behind
-    near: float  # through the image: meet one within 0.2 m
-    nothing: float  # meet none
+    back: float  # rays that hit a surface from behind
+    near: float  # rays through the image that hit a surface within 0.2 m
+    nothing: float  # rays that hit no surface
 
 
 class Views:
-    """Draws views of a scene."""
+    """Samples random views of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._meet = freeze(_meet)
-        # Fibonacci's lattice
+        self._first_hit = freeze(_first_hit)
+        # a Fibonacci lattice
         z = 1 - 2 * (np.arange(_RAYS) + 0.5) / _RAYS
         angle = np.pi * (1 + np.sqrt(5)) * np.arange(_RAYS)
         radius = np.sqrt(1 - z**2)
@@ -48,10 +48,10 @@ class Views:
         self._inverted = self._find_inverted()
 
     def sample(self, resolution: int, rng: np.random.Generator) -> Camera:
-        """A random view of the scene in its current state that passes the check.
+        """Return a random view of the scene in its current state that passes the check.
 
         Raises:
-            UserError: none does.
+            UserError: none of 100 views passes.
         """
         for _ in range(_TRIES):
             camera = sample_view(self.scene.description, resolution, rng)
@@ -60,15 +60,15 @@ class Views:
         shares = self.shares(camera)
         raise UserError(
             f"{self.scene.description.file}: camera: none of {_TRIES} random views shows the room (of the last one's "
-            f"rays {shares.back:.0%} meet surfaces from behind, {shares.near:.0%} within {_NEAR} m, "
-            f"{shares.nothing:.0%} none): move the box into the room"
+            f"rays, {shares.back:.0%} hit surfaces from behind, {shares.near:.0%} hit surfaces within {_NEAR} m, "
+            f"{shares.nothing:.0%} hit none); move the box into the room"
         )
 
     def passes(self, camera: Camera) -> bool:
-        return all(share <= _MOST[name] for name, share in self.shares(camera)._asdict().items())
+        return all(share <= _LIMITS[name] for name, share in self.shares(camera)._asdict().items())
 
     def shares(self, camera: Camera) -> Shares:
-        """What the rays of a view meet, in the current state."""
+        """Return the shares of a view's rays that mark a bad view, in the current state."""
         side = int(np.sqrt(_RAYS))
         rows, columns = (np.mgrid[:side, :side] + 0.5) / side
         image = camera.directions(np.stack([columns.ravel() * camera.width, rows.ravel() * camera.height], 1))
@@ -78,26 +78,26 @@ class Views:
         return Shares(share(back), (distance[_RAYS:] < _NEAR).mean(), share(np.isinf(distance)))
 
     def look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Of each ray: the distance (m), whether it meets the back of a shape, and a number for the shape."""
+        """Return, for each ray, the distance in metres, whether it hits the back of a shape, and a shape number."""
         units = self.scene.description.units_per_metre
         origins = np.tile(position * units, (len(directions), 1))
         lanes = {"origin": ("Point3f", origins), "direction": ("Vector3f", directions)}
-        distance, behind, shape = launch(self._meet, lanes, scene=self.scene.mi_scene)
+        distance, behind, shape = launch(self._first_hit, lanes, scene=self.scene.mi_scene)
         return distance / units, behind, shape
 
     def _find_inverted(self) -> np.ndarray:
-        """The shapes that show the camera volume their backs: faces of files that nobody has looked at from behind."""
+        """Return the shapes that are inside out: most rays from the camera volume hit their backs."""
         rng = np.random.default_rng(0)
         description = self.scene.description
         with self.scene.in_state(rest_state(description, self.scene.experiment)):
             looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
         distance, behind, shape = (np.concatenate(column) for column in zip(*looks, strict=True))
         hit = np.isfinite(distance)
-        numbers, which = np.unique(shape[hit], return_inverse=True)
-        return numbers[np.bincount(which, behind[hit]) > np.bincount(which) / 2]
+        numbers, inverse = np.unique(shape[hit], return_inverse=True)
+        return numbers[np.bincount(inverse, behind[hit]) > np.bincount(inverse) / 2]
 
 
-def _meet(scene: Any, origin: Any, direction: Any) -> tuple:
+def _first_hit(scene: Any, origin: Any, direction: Any) -> tuple:
     interaction = scene.ray_intersect(mi.Ray3f(origin, direction))
     valid = interaction.is_valid()
     behind = valid & (dr.dot(interaction.n, direction) > 0)

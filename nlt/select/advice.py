@@ -1,4 +1,4 @@
-"""What varies in a scene and an experiment, and so what a model of it can do without; nothing is trained."""
+"""Advice on what a model needs, from what varies in a scene and an experiment; nothing is trained."""
 
 from __future__ import annotations
 
@@ -20,20 +20,23 @@ from nlt.rendering.variant import choose_variant
 from nlt.scenes.assembly import Scene
 
 _VIEWS = 16
-_MOST = 1 << 16  # points and photons that are tried
+_MOST = 1 << 16  # number of points and of photons that are tried at most
 _COUNTS = tuple(1 << k for k in range(7, 17))
-_GAIN = 0.05  # of the pixels: twice as many points that cover less than this in addition are not worth it
+_GAIN = 0.05  # share of the pixels that a doubled number of points must cover in addition
 _FIELDS = ("depth", "normal", "camera_matrix", "world_to_view", "translation", "present", "photon_hit", "photon_valid")
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What a scene holds, in an experiment, that decides what a model of it needs.
+    """The properties of a scene in an experiment that decide what a model of it needs.
 
     Attributes:
-        moving: objects that states move or remove; `moving_lights`: those of them that emit.
-        materials: share of each of `MATERIALS` in the surface that may be seen, where it is above zero.
-        points: share of the pixels that see a surface that hold at least one of N points, by N; `photons`: of P.
+        scene: name of the scene.
+        moving: names of the objects that states move or remove.
+        moving_lights: names of those among them that emit light.
+        materials: share of each of `MATERIALS` in the visible surface, where it is above zero.
+        points: by N, the share of the pixels with a surface in which at least one of N points is visible.
+        photons: the same by P, for P photons.
     """
 
     scene: str
@@ -46,7 +49,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Advice:
-    """One answer: what a model needs of `subject`, and why; the `methods` that have no more, where it names any."""
+    """A piece of advice: what a model needs of `subject`, why, and the `methods` that have no more than that."""
 
     subject: str
     verdict: str
@@ -55,18 +58,18 @@ class Advice:
 
 
 def measure_facts(spec: DatasetSpec, views: int = _VIEWS) -> list[Facts]:
-    """Of every scene of a dataset in its experiment, at its resolution; a process per scene.
+    """Measure every scene of a dataset in its experiment, at its resolution, in a process per scene.
 
     Raises:
         UserError: a scene does not load.
     """
-    choose_variant()  # once; the processes inherit it
+    choose_variant()  # chosen once; the processes inherit it
     spec = dataclasses.replace(spec, points=_MOST, photons=_MOST, train=0, val=0, test=views)
     return [Process(_facts, spec, scene).result() for scene in range(len(spec.scenes))]
 
 
 def _facts(spec: DatasetSpec, scene: int) -> Facts:
-    torch.set_num_threads(1)  # in a process of its own: on a busy machine, threads that wait for each other take longer
+    torch.set_num_threads(1)  # affects this process only; on a busy machine, threads that wait are slower
     render = SampleRenderer(spec, scene)
     moving, lights = what_moves(render.scene)
     points = render.points()
@@ -81,35 +84,35 @@ def _facts(spec: DatasetSpec, scene: int) -> Facts:
         for name, (position, valid) in clouds.items():
             pixels = visible_pixels(torch.from_numpy(position)[None], torch.from_numpy(valid)[None], **camera)
             curves[name].append(occupancy(pixels[0].numpy(), sample["depth"].ravel() > 0, len(position)))
-    means = {name: {n: float(np.mean([c[n] for c in found])) for n in _COUNTS} for name, found in curves.items()}
+    means = {name: {n: float(np.mean([c[n] for c in views])) for n in _COUNTS} for name, views in curves.items()}
     return Facts(spec.descriptions[scene].name, moving, lights, shares_of_materials(points), **means)
 
 
 def shares_of_materials(points: dict[str, np.ndarray]) -> dict[str, float]:
-    """Share of the points by material, where it is above zero."""
+    """Return the share of the points by material, where it is above zero."""
     shares = np.bincount(points["material"], minlength=len(MATERIALS)) / len(points["material"])
     return {name: float(share) for name, share in zip(MATERIALS, shares, strict=True) if share > 0}
 
 
 def what_moves(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the objects that states move or remove; of those among them that emit light."""
+    """Return the names of the objects that states move or remove, and of those among them that emit light."""
     moving = [m for m in scene.movables if m.removable or np.ptp(m.box, axis=0).any()]
     emits = lambda m: any(scene.shapes[shape].emitter is not None for shape in m.shapes)
     return tuple(m.name for m in moving), tuple(m.name for m in moving if emits(m))
 
 
 def occupancy(pixels: np.ndarray, surface: np.ndarray, total: int) -> dict[int, float]:
-    """Share of the pixels in `surface` (H*W,) bool that hold one of n points at least, by n.
+    """Return, by n, the share of the pixels in `surface` (H*W,) bool that hold at least one of n points.
 
-    `pixels` (total,) as of `visible_pixels`. By rarefaction: with each of the total kept at probability n / total,
-    the expected share.
+    `pixels` (total,) are those of `visible_pixels`. The share is the expectation by rarefaction: each of the points is
+    kept with probability n / total.
     """
     held = np.bincount(pixels, minlength=len(surface) + 1)[:-1][surface]
     return {n: float(np.mean(1 - (1 - min(n / total, 1)) ** held)) if len(held) else 0.0 for n in _COUNTS}
 
 
 def enough(curve: dict[int, float]) -> int:
-    """The count from which on doubling covers less than 5 % of the pixels more; the most tried if there is none."""
+    """Return the count from which doubling covers less than 5 % more of the pixels, or the largest one tried."""
     counts = sorted(curve)
     for n, half in zip(reversed(counts), reversed(counts[:-1]), strict=False):
         if curve[n] - curve[half] >= _GAIN:
@@ -118,7 +121,7 @@ def enough(curve: dict[int, float]) -> int:
 
 
 def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
-    """What a model of a dataset needs: what any of its scenes needs."""
+    """Return what a model of a dataset needs, which is what any of its scenes needs."""
     return [
         _transport(facts),
         _view_direction(facts),
@@ -136,10 +139,10 @@ def _transport(facts: list[Facts]) -> Advice:
         reason = f"lights move or are removed: {_some(lights)}; photons say where light arrives in each state"
     elif moving:
         kind, methods = "points", ("nlt",)
-        reason = f"objects move or are removed: {_some(moving)}; no light does, so where it arrives is learned"
+        reason = f"objects move or are removed: {_some(moving)}; no light does, so a network can learn where it arrives"
     else:
         kind, methods = "none", ("feature_projection", "cnn")
-        reason = "nothing moves: what leaves a point is always the same; a feature of the point, or the U-Net, holds it"
+        reason = "nothing moves: the light leaving a point is always the same, so its feature or the U-Net can store it"
     return Advice("light transport", f"{kind}: {', '.join(methods)}", reason, methods)
 
 
@@ -147,10 +150,10 @@ def _view_direction(facts: list[Facts]) -> Advice:
     shares = {name: float(np.mean([fact.materials.get(name, 0) for fact in facts])) for name in MATERIALS}
     specular = {name: share for name, share in shares.items() if share and name != "diffuse"}
     if not specular:
-        reason = "every surface is diffuse: it looks the same from everywhere"
+        reason = "every surface is diffuse: it looks the same from every direction"
         return Advice("view direction", "not needed: ablation without ray_direction", reason)
     listed = ", ".join(f"{name} {share:.2%}" for name, share in specular.items())
-    return Advice("view direction", "needed", f"of the surface that may be seen, {listed}")
+    return Advice("view direction", "needed", f"shares of the visible surface: {listed}")
 
 
 def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
@@ -159,10 +162,10 @@ def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
     verdict = f"{best:,} of {count:,}" if best < count else f"all {count:,}"
     reason = (
         f"{share(count):.0%} of the pixels with a surface hold one of {count:,}, {share(best):.0%} one of {best:,}; "
-        f"beyond those, twice as many would add less than {_GAIN:.0%}"
+        f"doubling that number would add less than {_GAIN:.0%}"
     )
     if best == max(_COUNTS):
-        reason = reason.partition(";")[0] + "; more were not tried"
+        reason = reason.partition(";")[0] + "; larger numbers were not tried"
     return Advice(what, verdict, reason)
 
 
@@ -172,9 +175,9 @@ def _some(names: list[str]) -> str:
 
 
 def table(advice: list[Advice], facts: list[Facts]) -> str:
-    """Markdown: the answers with their reasons, and the coverage behind them."""
+    """Return the advice with its reasons and the coverage behind it, as Markdown."""
     lines = ["# What varies", "", "| | needs | because |", "|---|---|---|"]
-    lines += [f"| {each.subject} | {each.verdict} | {each.reason} |" for each in advice]
+    lines += [f"| {item.subject} | {item.verdict} | {item.reason} |" for item in advice]
     lines += ["", "Share of the pixels with a surface that hold at least one of so many, mean over random views:", ""]
     lines += [f"| | {' | '.join(f'{n:,}' for n in _COUNTS)} |", "|---|" + "---:|" * len(_COUNTS)]
     for fact in facts:

@@ -1,7 +1,7 @@
-"""The statistics of a choice: paired standard errors, and the fastest of those that are as good as the best.
+"""The statistics of a choice: paired standard errors, and the cheapest candidate that is as good as the best.
 
-Errors are (S, N) arrays: seeds of training by validation images, the same images and as many seeds for all. Lower is
-better, so MSSIM goes in as 1 - MSSIM.
+Errors are (S, N) arrays of training seeds by validation images, with the same images and number of seeds for all
+candidates. Lower is better, so MSSIM is given as 1 - MSSIM.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ Errors = Mapping[Key, np.ndarray]
 
 
 def paired_difference(errors: np.ndarray, others: np.ndarray) -> tuple[float, float]:
-    """Mean of errors - others (S, N), and its standard error over images and, if there are several, seeds.
+    """Return the mean of errors - others (S, N) and its standard error over images and, if there are several, seeds.
 
     Images and seeds are crossed random effects: var(mean) = images / N + seeds / S + rest / (S N), estimated from the
-    mean squares of the two-way layout. With one seed, the standard error of the mean over images.
+    mean squares of the two-way layout. With one seed, the error is the standard error of the mean over images.
     """
     difference = errors - others
     seeds, images = difference.shape
@@ -29,26 +29,26 @@ def paired_difference(errors: np.ndarray, others: np.ndarray) -> tuple[float, fl
         return mean, float(np.sqrt(by_image))
     by_seed = difference.mean(1).var(ddof=1) / seeds
     rest = difference - difference.mean(0) - difference.mean(1, keepdims=True) + mean
-    # Both hold the rest once: it is taken out once. Where chance makes that too much, the larger of the two stays.
+    # Both contain the rest, so subtract it once. Where chance makes it too large, keep the larger of the two.
     noise = (rest**2).sum() / ((seeds - 1) * (images - 1)) / (seeds * images)
     return mean, float(np.sqrt(max(by_image + by_seed - noise, by_image, by_seed)))
 
 
 def within(errors: Errors[Key], limit: float = 1.0) -> list[Key]:
-    """Those whose mean is within `limit` paired standard errors of the best mean."""
+    """Return the keys whose mean error is within `limit` paired standard errors of the best mean."""
     best = min(errors, key=lambda key: errors[key].mean())
-    found = []
+    good = []
     for key in errors:
         mean, error = paired_difference(errors[key], errors[best])
         if mean <= limit * error:
-            found.append(key)
-    return found
+            good.append(key)
+    return good
 
 
 def choose(metrics: Sequence[Errors[Key]], cost: Mapping[Key, float]) -> Key:
-    """The cheapest of those that are within one paired standard error of the best, by every metric.
+    """Return the cheapest key that is within one paired standard error of the best by every metric.
 
-    Where the metrics agree on none, by the first metric alone.
+    If no key is, only the first metric decides.
     """
     good = [within(errors) for errors in metrics]
     agreed = [key for key in good[0] if all(key in others for others in good[1:])]
@@ -56,10 +56,11 @@ def choose(metrics: Sequence[Errors[Key]], cost: Mapping[Key, float]) -> Key:
 
 
 def ranked(metrics: Sequence[Errors[Key]], cost: Mapping[Key, float]) -> list[Key]:
-    """The order in which candidates are worth going on with.
+    """Return the order in which candidates are worth continuing.
 
-    First those that no other one beats, being at most as costly and, by every metric, at least as good; then those
-    that only these beat, and so on. Within each of these fronts, by the mean of their ranks in the metrics.
+    The first front holds the candidates that no other one beats by being at most as costly and, by every metric, at
+    least as good; the next front those that only the first one beats, and so on. Within a front, candidates are ordered
+    by the sum of their ranks in the metrics.
     """
     means = {key: tuple(float(errors[key].mean()) for errors in metrics) for key in metrics[0]}
     ranks = {key: sum(sorted(m[k] for m in means.values()).index(v) for k, v in enumerate(means[key])) for key in means}

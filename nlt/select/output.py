@@ -1,4 +1,4 @@
-"""What a selection shows: its table, and the front of accuracy against time."""
+"""The output of a selection: its table, and the front of accuracy against time."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ Row = Mapping[str, Any]
 
 
 def markdown(name: str, rows: Sequence[Row], confirmed: Sequence[Row], record: Mapping[str, Any]) -> str:
-    """What was chosen, what it saves, the claims on the test split, and every candidate."""
+    """Return the table of a selection: the choice, its claims on the test split, and every candidate."""
     picks = {row["role"]: row for row in confirmed}
     chosen, full = picks["chosen"], picks.get("full model")
     row = next(row for row in rows if row["chosen"])
     by = [key for key in _SCORES if row[f"{key}_behind"] <= row[f"{key}_behind_error"]]
     rule = f"the fastest within one paired standard error of the best on the validation split, by {_names(by)}"
     if len(by) < len(_SCORES):
-        rule += " alone: no candidate is by both"
+        rule += " alone, because no candidate is by both"
     lines = [f"# The model that {name} needs", "", f"**{chosen['candidate']}**: {rule}."]
     against = claims(chosen, full) if full else []
     lines += ["", *(f"- {verdict}: {claim}" for claim, verdict in against), f"- {_by_parameters(confirmed)}"]
     size = f"{record['n_test']} views, {len(record['seeds'])} seeds"
-    how = "in brackets how much worse than the full model, ± the paired standard error"
+    how = "in brackets, how much worse than the full model, ± the paired standard error"
     lines += ["", f"On the test split ({size}); {how}:", ""]
     lines += _confirmed({name: confirmed})
-    lines += ["", f"Every candidate, on the validation split ({record['n_val']} views); in brackets how far behind the "
-              "best:", ""]  # fmt: skip
+    lines += ["", f"Every candidate, on the validation split ({record['n_val']} views); in brackets, how far behind "
+              "the best:", ""]  # fmt: skip
     lines += [_line(["candidate", "steps", *(heading(key) for key in (*_COSTS, *_SCORES)), ""])]
     lines += [_line(["---", *["---:"] * (1 + len(_COSTS) + len(_SCORES)), "---"])]
     tried, rest = [row for row in rows if row.get("steps")], [row for row in rows if not row.get("steps")]
@@ -47,27 +47,27 @@ def markdown(name: str, rows: Sequence[Row], confirmed: Sequence[Row], record: M
         status = ", ".join([row["status"], *(role for role in ("chosen", "full") if row[role])])
         lines.append(_line([*cells, *(_score(row, key, "behind") for key in _SCORES), status]))
     if rest:
-        lines += ["", f"Not tried, for want of time: {'; '.join(row['candidate'] for row in rest)}."]
+        lines += ["", f"Not tried for lack of time: {'; '.join(row['candidate'] for row in rest)}."]
     lines += ["", "Where the numbers come from: manifest.json, table.csv, confirmed.csv, views.csv.", ""]
     return "\n".join(lines)
 
 
 def claims(chosen: Row, full: Row) -> list[tuple[str, str]]:
-    """What selecting promises against always taking the full model: the claim with its numbers, holds or fails."""
-    found = []
+    """Return the claims of a choice over always taking the full model, with numbers, and whether each holds."""
+    tested = []
     for key in _SCORES:
         worse, error = chosen[f"{key}_worse"], chosen[f"{key}_worse_error"]
         claim = f"within one standard error of the full model in {QUANTITIES[key].label} on the test split"
-        found.append((f"{claim}: worse by {_number(key, worse)} ± {_number(key, error)}", worse <= error))
+        tested.append((f"{claim}: worse by {_number(key, worse)} ± {_number(key, error)}", worse <= error))
     ratio = full["time_per_frame_s"] / chosen["time_per_frame_s"]
-    found.append((f"at least 2x cheaper per frame: {ratio:.2f}x", ratio >= 2))
+    tested.append((f"at least 2x cheaper per frame: {ratio:.2f}x", ratio >= 2))
     saved = ", ".join(f"{QUANTITIES[key].label} {_saved(key, chosen, full)}" for key in _COSTS)
-    verdicts = [(claim, "holds" if holds else "FAILS") for claim, holds in found]
+    verdicts = [(claim, "holds" if holds else "FAILS") for claim, holds in tested]
     return [*verdicts, (saved, "saved")]
 
 
 def _by_parameters(rows: Sequence[Row]) -> str:
-    """What the choice would have been by the number of parameters instead of the time per frame."""
+    """Return what the number of parameters would have chosen instead of the time per frame."""
     chosen, fewest = row_of(rows, "chosen"), row_of(rows, "by parameters")
     if chosen["candidate"] == fewest["candidate"]:
         return "compared: picking by the number of parameters gives the same model"
@@ -103,9 +103,9 @@ def _line(cells: list[Any]) -> str:
 
 
 def draw_front(directory: Path, rows: Sequence[Row]) -> None:
-    """front.png and .svg: accuracy against time per frame, a panel per score; the chosen and the full model marked.
+    """Draw front.png and .svg: accuracy against time per frame, one panel per score, with the chosen and full model.
 
-    Faint: dropped after fewer steps. Bars: the paired standard error of the difference from the best.
+    Faint candidates were dropped after fewer steps. Bars are paired standard errors of the difference from the best.
     """
     figure, axes = plt.subplots(1, len(_SCORES), figsize=(11, 4.8))
     methods = list(dict.fromkeys(row["method"] for row in rows))[::-1]
@@ -131,10 +131,10 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
                         axis.annotate(role, at, (0, 13), textcoords="offset points", ha="center", fontsize=8,
                                       weight="bold", color=colour, path_effects=HALO, zorder=5)  # fmt: skip
                 if final:
-                    what = row["candidate"].partition("@")[2].replace(" points", "").replace(" photons", "")
+                    setting = row["candidate"].partition("@")[2].replace(" points", "").replace(" photons", "")
                     labelled += 1
                     below = (0, -18 - 9 * (labelled % 2))
-                    axis.annotate(what, at, below, textcoords="offset points", ha="center", fontsize=6,
+                    axis.annotate(setting, at, below, textcoords="offset points", ha="center", fontsize=6,
                                   path_effects=HALO, zorder=5)  # fmt: skip
             axis.plot([], [], label=label(method), **style)
         axis.set_xscale("log")
@@ -148,7 +148,7 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
         axis.grid(alpha=0.3, which="both")
         axis.margins(0.15, 0.15)
     steps = sorted({row["steps"] for row in scored})
-    title = f"filled: {steps[-1]} steps, with size, points and photons; faint: dropped before"
+    title = f"filled: {steps[-1]} steps, labelled with size, points and photons; faint: dropped earlier"
     figure.suptitle(title, fontsize=9)
     axes[0].legend(fontsize=8)
     figure.tight_layout()
@@ -156,29 +156,29 @@ def draw_front(directory: Path, rows: Sequence[Row]) -> None:
 
 
 def row_of(rows: Sequence[Row], role: str) -> Row:
-    """The row of confirmed.csv that is the chosen one, the full model, the best, or that by parameters."""
+    """Return the row of confirmed.csv with a role: "chosen", "full model", "best" or "by parameters"."""
     return next(row for row in rows if row["role"] == role)
 
 
-def summary(found: Mapping[str, Sequence[Row]]) -> str:
-    """Several selections: what each picked and what holds of it, from their rows of confirmed.csv by name."""
-    picked = {row_of(rows, "chosen")["candidate"] for rows in found.values()}
-    verdict = "holds" if len(picked) == len(found) else "FAILS"
-    lines = ["# Selections", "", f"- {verdict}: different models are picked: {len(picked)} in {len(found)} cases"]
-    for case, rows in found.items():
+def summary(selections: Mapping[str, Sequence[Row]]) -> str:
+    """Return a summary of several selections, from their rows of confirmed.csv by name: picks and claims."""
+    picked = {row_of(rows, "chosen")["candidate"] for rows in selections.values()}
+    verdict = "holds" if len(picked) == len(selections) else "FAILS"
+    lines = ["# Selections", "", f"- {verdict}: different models are picked: {len(picked)} in {len(selections)} cases"]
+    for case, rows in selections.items():
         if any(row["role"] == "full model" for row in rows):
             pairs = claims(row_of(rows, "chosen"), row_of(rows, "full model"))
             lines += [f"- {verdict}: {case}: {claim}" for claim, verdict in pairs]
         lines.append(f"- {case}: {_by_parameters(rows)}")
     lines += ["", "On the test split; in brackets how much worse than the full model, ± the paired standard error.", ""]
-    return "\n".join([*lines, *_confirmed(found), ""])
+    return "\n".join([*lines, *_confirmed(selections), ""])
 
 
-def _confirmed(found: Mapping[str, Sequence[Row]]) -> list[str]:
-    """A Markdown table of rows of confirmed.csv, by case."""
+def _confirmed(selections: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return a Markdown table of rows of confirmed.csv, by case."""
     lines = [_line(["", "", "candidate", *(heading(key) for key in (*_COSTS, *_SCORES))])]
     lines += [_line([*["---"] * 3, *["---:"] * (len(_COSTS) + len(_SCORES))])]
-    for case, rows in found.items():
+    for case, rows in selections.items():
         for row in rows:
             cells = [case, row["role"], row["candidate"], *(text(key, row.get(key)) for key in _COSTS)]
             lines.append(_line([*cells, *(_score(row, key, "worse") for key in _SCORES)]))

@@ -1,4 +1,4 @@
-"""`nlt select`: the smallest model that a scene needs: from what varies in it, and from what trainings measure."""
+"""`nlt select`: the smallest model that a scene needs, from what varies in the scene and from short trainings."""
 
 from __future__ import annotations
 
@@ -25,29 +25,32 @@ from nlt.select.trials import SCORES, as_error
 from nlt.waiting import wait_passively
 
 Row = dict[str, Any]
-# What each row of confirmed.csv is.
+# The roles of the rows of confirmed.csv.
 CHOSEN, FULL, BEST, FEWEST = "chosen", "full model", "best", "by parameters"
 
 
 def select(config: str, minutes: float | None = None, out: str | None = None, only_advice: bool = False) -> Path | None:
-    """Say what varies in a dataset's scenes, then search the space; write the results to a directory.
+    """Print what varies in a dataset's scenes, then search the space and write the results to a directory.
+
+    Returns:
+        The directory; None with `only_advice`.
 
     Raises:
         UserError: the config is wrong, or the minutes are too few.
     """
     start, begun = time.time(), origin()
-    wait_passively()  # where frames are timed; this process, which trains, has loaded torch and goes on spinning
+    wait_passively()  # in the process that times frames; this one has already loaded torch, so its threads still spin
     space = SearchSpace.load(config, minutes)
     facts = advice.measure_facts(space.spec)
     advised = advice.advise(space.spec, facts)
-    for each in advised:
-        print(f"{each.subject}: {each.verdict}\n    {each.reason}", flush=True)
+    for item in advised:
+        print(f"{item.subject}: {item.verdict}\n    {item.reason}", flush=True)
     if only_advice:
         return None
     directory = Path(out or Path("results/select") / space.name)
     write_bytes(directory / "advice.md", advice.table(advised, facts).encode())
     dataset = generate(space.spec, space.root)
-    methods = [method for each in advised for method in each.methods]
+    methods = [method for item in advised for method in item.methods]
     search = Search(space, dataset, Path("runs") / dataset.name / "select", methods)
     finals = search.run()
     times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
@@ -56,7 +59,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     best = min(finals, key=lambda c: errors[0][c].mean())
     picks = {CHOSEN: choose(errors, times), FULL: space.full, BEST: best, FEWEST: choose(errors, parameters)}
     if space.full not in finals:
-        print("the full model was not trained as long as the last: nothing is compared with it", flush=True)
+        print("the full model was not trained to the end, so nothing is compared with it", flush=True)
         del picks[FULL]
     confirmed = _confirm(search, picks)
     rows = _rows(search, finals, picks[CHOSEN])
@@ -76,7 +79,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
         "n_val": space.spec.val * len(space.spec.scenes),
         "n_test": space.spec.test * len(space.spec.scenes),
         "facts": [asdict(fact) for fact in facts],
-        "advice": [asdict(each) for each in advised],
+        "advice": [asdict(item) for item in advised],
         "configs": {c.name: space.config(c) for c in finals},
         "wall_time_s": round(time.time() - start, 1),
     }
@@ -84,7 +87,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     text = markdown(space.name, rows, confirmed, record)
     write_bytes(directory / "table.md", text.encode())
     draw_front(directory, rows)
-    print(f"\n{text}\nwritten to {directory}; go on with: nlt fit --config {directory}/chosen.yaml", flush=True)
+    print(f"\n{text}\nwritten to {directory}; train with: nlt fit --config {directory}/chosen.yaml", flush=True)
     return directory
 
 
@@ -94,9 +97,9 @@ def _chosen(space: SearchSpace, candidate: Candidate) -> str:
 
 
 def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Row]:
-    """A row per candidate of the space; scores are of the validation split, differences from the best's paired."""
+    """Return a row per candidate of the space: validation scores, and paired differences from the best."""
     errors = {key: search.errors(finals, key) for key in SCORES}
-    best = {key: min(each, key={c: e.mean() for c, e in each.items()}.__getitem__) for key, each in errors.items()}
+    best = {key: min(own, key={c: e.mean() for c, e in own.items()}.__getitem__) for key, own in errors.items()}
     rows = []
     for candidate in search.space.candidates:
         row: Row = {"candidate": candidate.name, **asdict(candidate), "chosen": int(candidate == chosen)}
@@ -116,15 +119,15 @@ def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Ro
 
 
 def _confirm(search: Search, picks: dict[str, Candidate]) -> list[Row]:
-    """The picks on the test split, which nothing has been decided by: scores, and the paired difference from the full
+    """Return the picks' scores on the test split, which no decision has used, and paired differences from the full
     model."""
-    found = {c: [_test_scores(search, c, seed) for seed in search.seeds] for c in set(picks.values())}
+    scores_of = {c: [_test_scores(search, c, seed) for seed in search.seeds] for c in set(picks.values())}
     rows = []
     for role, candidate in picks.items():
         row: Row = {"role": role, "candidate": candidate.name} | search.entries[candidate].cost
         for key in SCORES:
-            errors = {c: as_error(key, np.array([each[key] for each in scores])) for c, scores in found.items()}
-            row[key] = float(np.mean([each[key] for each in found[candidate]]))
+            errors = {c: as_error(key, np.array([scores[key] for scores in seeds])) for c, seeds in scores_of.items()}
+            row[key] = float(np.mean([scores[key] for scores in scores_of[candidate]]))
             if FULL in picks:
                 mean, error = paired_difference(errors[candidate], errors[picks[FULL]])
                 row |= {f"{key}_worse": mean, f"{key}_worse_error": error}
@@ -140,12 +143,12 @@ def _test_scores(search: Search, candidate: Candidate, seed: int) -> dict[str, l
 
 
 def _views(search: Search, finals: list[Candidate]) -> list[Row]:
-    """Every validation image's scores of those trained longest."""
+    """Return the scores of every validation image for the candidates that were trained longest."""
     rows = []
     for candidate in finals:
         scores = {key: search.scores(candidate, key, search.seeds) for key in SCORES}
         for s, seed in enumerate(search.seeds):
             for view in range(scores[SCORES[0]].shape[1]):
-                each = {key: float(values[s, view]) for key, values in scores.items()}
-                rows.append({"candidate": candidate.name, "seed": seed, "view": view, **each})
+                view_scores = {key: float(values[s, view]) for key, values in scores.items()}
+                rows.append({"candidate": candidate.name, "seed": seed, "view": view, **view_scores})
     return rows

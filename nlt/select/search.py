@@ -1,4 +1,4 @@
-"""Successive halving of a space's candidates under a budget of time (Jamieson and Talwalkar 2016)."""
+"""Successive halving of a space's candidates under a time budget (Jamieson and Talwalkar 2016)."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from nlt.select.choice import ranked
 from nlt.select.space import Candidate, SearchSpace
 from nlt.select.trials import SCORES, Trials, as_error
 
-_ETA, _RUNGS = 3, 3  # one in three goes on, at most so often
-_LEAST = 3  # candidates in the last round
-_ENOUGH = 10  # candidates: below these, rather fewer steps
-_TIMING = 0.1  # of the budget, at most, for the times per step, and as much for those per frame
-_SETUP = 3.0  # seconds a training takes beside its steps, about
-_RECENT = 5  # trainings, by which the estimates are corrected
+_ETA, _ROUNDS = 3, 3  # one in three candidates continues; the largest number of planned rounds
+_LEAST = 3  # least number of candidates in the last round
+_ENOUGH = 10  # candidates; if fewer fit into the budget, the rounds get fewer steps
+_TIMING = 0.1  # share of the budget, at most, for timing steps, and as much again for timing frames
+_SETUP = 3.0  # seconds that a training takes in addition to its steps, about
+_RECENT = 5  # number of the last trainings by which the estimates are corrected
 
 now = time.perf_counter
 
 
 @dataclass
 class Entry:
-    """What is known of a candidate: times and sizes; scores by seed, after `steps` steps; why it went no further."""
+    """A candidate's record: its times and sizes, the steps it was trained for, and why it was not trained longer."""
 
     candidate: Candidate
     cost: dict[str, Any]
@@ -49,11 +49,11 @@ class Entry:
 
 
 class Search:
-    """Trains a space's candidates, the worse of them for a short time only.
+    """Trains a space's candidates, the worse ones for a short time only.
 
-    The full model and the best candidate of each method in `advised` go to the end: a method that has to learn what
-    others are given, such as where light arrives in a scene in which nothing moves, is behind them at first.
-    Every decision follows from what lies in `directory`: killed and started again, the search goes on and ends alike.
+    The full model and the best candidate of each method in `advised` continue to the last round. A method that has to
+    learn what others are given, for example where light arrives in a static scene, is worse than them at first.
+    Every decision follows from the files in `directory`, so a search that is killed and restarted ends the same.
     """
 
     def __init__(self, space: SearchSpace, dataset: Any, root: Path, advised: Sequence[str] = ()) -> None:
@@ -67,7 +67,7 @@ class Search:
         self.spent = 0.0
         self.entries: dict[Candidate, Entry] = {}
         self.seeds = [0]
-        self._ratios: list[float] = []  # of the time that trainings took, to what was estimated before the first
+        self._ratios: list[float] = []  # measured over initially estimated time of each training
         trainer = space.config(space.full)
         self._most, batch_size = trainer["trainer"]["max_steps"], trainer["data"].get("batch_size", 32)
         self._epoch = max(1, len(space.spec.scenes) * space.spec.train // batch_size)
@@ -76,10 +76,10 @@ class Search:
     # --- the plan ---
 
     def plan(self) -> None:
-        """Measure the candidates and decide how many fit, and the rounds.
+        """Measure the candidates' costs, and decide the rounds and how many candidates fit into the budget.
 
         Raises:
-            UserError: the budget is too small for any.
+            UserError: the budget is too small for two candidates.
         """
         file = self.directory / "plan.json"
         if not file.exists():
@@ -101,7 +101,7 @@ class Search:
         )
 
     def _plan(self) -> dict[str, Any]:
-        """The steps of the rounds, and what every candidate costs: per step, and per frame with all taking turns."""
+        """Return the rounds' steps and every candidate's cost per step and, with interleaved timing, per frame."""
         begin, rounds = now(), self._steps(self._most)
         threads = self._set_fastest_threads()
         for candidate in self.space.candidates:
@@ -120,7 +120,7 @@ class Search:
         return {"rungs": rounds, "costs": costs, "spent_s": now() - begin, "threads": threads}
 
     def _set_fastest_threads(self) -> int:
-        """Train with one thread or with all: on a busy machine all are slower, for they wait for one another."""
+        """Train with one thread or all, whichever is faster; on a busy machine, all are slower because they wait."""
         seconds = {}
         for threads in (1, torch.get_num_threads()):
             torch.set_num_threads(threads)
@@ -130,18 +130,18 @@ class Search:
         return threads
 
     def _steps(self, last: int) -> list[int]:
-        """Steps of the rounds, each a third of the next, in whole epochs: so going on is exact."""
+        """Return the rounds' steps, each a third of the next, in whole epochs so that resuming is exact."""
         steps = [max(1, round(last / self._epoch)) * self._epoch if last > self._epoch else last]
-        for k in range(1, _RUNGS):
+        for k in range(1, _ROUNDS):
             fewer = max(1, round(last / _ETA**k / self._epoch)) * self._epoch
             if fewer < steps[0]:
                 steps.insert(0, fewer)
         return steps
 
     def _step_s(self, module: RenderingModule) -> float:
-        """Seconds of a training step: the least of two, after a first."""
-        data, wanted = self.trials.split("train", module.fields), self._batch_size
-        batch = default_collate([data[k % len(data)] for k in range(wanted)])
+        """Return the seconds of a training step: the least of two, after a warm-up step."""
+        data, size = self.trials.split("train", module.fields), self._batch_size
+        batch = default_collate([data[k % len(data)] for k in range(size)])
         batch = {name: value.to(self.device) for name, value in batch.items()}
         module = module.to(self.device).train()
         (optimizer,), _ = module.configure_optimizers()
@@ -158,33 +158,33 @@ class Search:
         return min(seconds[1:])
 
     def _counts(self, rounds: list[int], first: int) -> list[int]:
-        """How many candidates are in each round, if so many are in the first."""
+        """Return the number of candidates in each round, with `first` in the first one."""
         return [max(math.ceil(first / _ETA**k), min(_LEAST, first)) for k in range(len(rounds))]
 
     def _estimate(self, candidate: Candidate, steps: int) -> float:
-        """Seconds: as was measured before, corrected by what trainings took of late."""
+        """Return a training's estimated seconds, corrected by the latest trainings."""
         return self._nominal(candidate, steps) * (statistics.median(self._ratios[-_RECENT:]) if self._ratios else 1.0)
 
     def _nominal(self, candidate: Candidate, steps: int) -> float:
         return _SETUP + steps * float(self.entries[candidate].cost["step_s"])
 
     def _cost(self, order: list[Candidate], rounds: list[int], done: int = 0) -> float:
-        """Seconds that the rounds from `done` on take at most, with `order` in the first of them; seeds included."""
-        dearest = sorted(order, key=lambda c: (c != self.space.full, -self.entries[c].cost["step_s"]))
+        """Return the most seconds that the rounds from `done` on take, seeds included, if `order` enters the first."""
+        costliest = sorted(order, key=lambda c: (c != self.space.full, -self.entries[c].cost["step_s"]))
         counts, total = self._counts(rounds[done:], len(order)), 0.0
         for count, steps, begun in zip(counts, rounds[done:], [0, *rounds][done:], strict=False):
-            total += sum(self._estimate(c, steps - begun) for c in dearest[:count])
-        return total + (self.space.seeds - 1) * sum(self._estimate(c, rounds[-1]) for c in dearest[: counts[-1]])
+            total += sum(self._estimate(c, steps - begun) for c in costliest[:count])
+        return total + (self.space.seeds - 1) * sum(self._estimate(c, rounds[-1]) for c in costliest[: counts[-1]])
 
     def _fits(self, order: list[Candidate], first: int, rounds: list[int], trained: int = 0) -> bool:
-        """Whether the first of `order` fit into what is left of the budget; `trained` of them are through round one."""
+        """Return whether the `first` ones of `order` fit the budget; `trained` of them have finished round one."""
         paid = sum(self._estimate(c, rounds[0]) for c in order[:trained])
         return self.spent - paid + self._cost(order[:first], rounds) <= self.budget
 
     # --- the search ---
 
     def run(self) -> list[Candidate]:
-        """Those that were trained longest, each with scores of all `seeds`: at the same number of steps."""
+        """Return the candidates trained longest, all for the same steps and with scores for all `seeds`."""
         self.plan()
         finals = self._round(0, list(self.entries))
         if not finals:
@@ -197,7 +197,7 @@ class Search:
             for candidate in order[keep:]:
                 self.entries[candidate].status = f"dropped after {self.rounds[k - 1]} steps"
             finals = self._round(k, order[:keep]) or finals
-        while (last := self.rounds[-1]) < self._most:  # less had been hoped for than there was time
+        while (last := self.rounds[-1]) < self._most:  # there is more time than was planned
             rounds = [*self.rounds, min(_ETA * last, self._most // self._epoch * self._epoch)]
             if rounds[-1] == last or self.spent + self._cost(finals, rounds, len(self.rounds)) > self.budget:
                 break
@@ -209,25 +209,25 @@ class Search:
         return finals
 
     def _round(self, k: int, order: list[Candidate]) -> list[Candidate]:
-        """Train candidates up to a round, as long as there is time; those that did not diverge."""
+        """Train candidates to the end of round `k` while there is time; return those that did not diverge."""
         steps, begun = self.rounds[k], self.rounds[k - 1] if k else 0
-        alive = []
+        converged = []
         for number, candidate in enumerate(order, 1):
             late = self.spent + self._estimate(candidate, steps - begun) > self.budget
-            if k == 0 and number > 2:  # room for the rounds that follow, too
+            if k == 0 and number > 2:  # leave time for the later rounds
                 late = not self._fits(order, number, self.rounds, number - 1)
             if late and (candidate != self.space.full or self.spent >= self.budget):
                 self.entries[candidate].status = f"no time left after {begun} steps"
                 continue
             if self.train(candidate, 0, steps, begun):
-                alive.append(candidate)
+                converged.append(candidate)
             left = (self.budget - self.spent) / 60
             print(f"round {k + 1} of {len(self.rounds)}, {number} of {len(order)}: {candidate.name}: {steps} steps; "
                   f"{left:.1f} of {self.space.minutes:g} min left", flush=True)  # fmt: skip
-        return alive
+        return converged
 
     def _more_seeds(self, finals: list[Candidate]) -> list[Candidate]:
-        """Train them with further seeds, as long as there is time for all; those that did not diverge."""
+        """Train the finalists with further seeds while there is time for all; return those that did not diverge."""
         steps = self.entries[finals[0]].steps
         for seed in range(1, self.space.seeds):
             left, done = list(finals), list[Candidate]()
@@ -244,37 +244,37 @@ class Search:
         return finals
 
     def _order(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Those worth going on with first: the full model, the best of each advised method, the others."""
+        """Return candidates by priority: the full model, the best of each advised method, the others."""
         times = {c: float(self.entries[c].cost["time_per_frame_s"]) for c in candidates}
         order = ranked([self.errors(candidates, key) for key in SCORES], times)
         advised = {c.method: c for c in reversed(order) if c.method in self.advised}.values()
         return sorted(order, key=lambda c: 0 if c == self.space.full else 1 if c in advised else 2)
 
     def train(self, candidate: Candidate, seed: int, steps: int, begun: int) -> bool:
-        """Train on from `begun` to `steps` and score on the validation split; False if it diverges."""
+        """Train from `begun` to `steps` and score on the validation split; return False if the training diverges."""
         entry = self.entries[candidate]
-        found = self.trials.train(candidate, seed, steps, begun, entry.cost["step_s"])
-        self.spent += found["seconds"]
-        if "diverged" in found:
+        result = self.trials.train(candidate, seed, steps, begun, entry.cost["step_s"])
+        self.spent += result["seconds"]
+        if "diverged" in result:
             entry.status = "diverged"
             return False
-        self._ratios.append(found["seconds"] / self._nominal(candidate, steps - begun))
+        self._ratios.append(result["seconds"] / self._nominal(candidate, steps - begun))
         entry.steps = steps
         return True
 
     def scores(self, candidate: Candidate, key: str, seeds: Sequence[int]) -> np.ndarray:
-        """(S, N) on the validation split, after all the candidate's steps: seeds and images."""
+        """Return validation scores (S, N), seeds by images, after all of the candidate's steps."""
         return self.trials.scores(candidate, key, seeds, self.entries[candidate].steps)
 
     def errors(self, candidates: list[Candidate], key: str) -> dict[Candidate, np.ndarray]:
-        """Scores of candidates that were trained with all `seeds`, as errors: the lower the better."""
+        """Return the scores of candidates trained with all `seeds` as errors, of which lower is better."""
         return {c: as_error(key, self.scores(c, key, self.seeds)) for c in candidates}
 
 
 def frame_costs(
     space: SearchSpace, dataset: LightTransportDataset, candidates: list[Candidate], seconds: float
 ) -> list[dict[str, Any]]:
-    """What a frame of each candidate takes, all taking turns for `seconds`, and its sizes."""
+    """Return each candidate's time per frame, by interleaved timing for `seconds`, and its sizes."""
     modules = {candidate.slug: space.build(candidate) for candidate in candidates}
     clock = Clock(Frames(dataset), default_device())
     laps = clock.time_interleaved(modules, seconds)

@@ -1,4 +1,4 @@
-"""What a config of configs/select asks for: a space of models, from the leanest to the full one."""
+"""The search space of a config in configs/select: models from the leanest to the full one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _KEYS = ("data", "scale", "methods", "sizes", "points", "photons", "minutes", "s
 
 @dataclass(frozen=True)
 class Candidate:
-    """A round of the space; `points` and `photons` are None where the method reads none."""
+    """A model of the space; `points` and `photons` are None where the method reads none."""
 
     method: str
     size: str
@@ -29,13 +29,13 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Such as "nlt@small, 1,024 points"."""
+        """The candidate's name, for example "nlt@small, 1,024 points"."""
         counts = ((self.points, "points"), (self.photons, "photons"))
         return ", ".join([f"{self.method}@{Path(self.size).stem}", *(f"{n:,} {what}" for n, what in counts if n)])
 
     @property
     def slug(self) -> str:
-        """The name, for a directory."""
+        """The candidate's name as a directory name."""
         parts = (self.method.replace("/", "-"), Path(self.size).stem, self.points, self.photons)
         return "-".join(str(part) for part in parts if part)
 
@@ -44,7 +44,7 @@ class Candidate:
 class SearchSpace:
     """The candidates: every method in every size, with every number of points and of photons that it reads.
 
-    `methods` and `sizes` are in the config's order, `points` and `photons` ascend: the last ones make the full model.
+    `methods` and `sizes` keep the config's order, `points` and `photons` ascend. The last ones make the full model.
     """
 
     name: str
@@ -59,7 +59,7 @@ class SearchSpace:
 
     @classmethod
     def load(cls, config: str, minutes: float | None = None) -> SearchSpace:
-        """Read a config by name or path; `minutes` overrides its own.
+        """Read a config by name or path; `minutes` overrides the config's.
 
         Raises:
             UserError: a key is unknown, missing or wrong.
@@ -69,7 +69,7 @@ class SearchSpace:
         check_keys(f"{file}: ", content, _KEYS, _KEYS)
         for key in ("data", "scale"):
             if not isinstance(content[key], str):
-                raise UserError(f"{file}: {key}: must be the name of a config of configs/{key}, is {content[key]!r}")
+                raise UserError(f"{file}: {key}: must be the name of a config in configs/{key}, is {content[key]!r}")
         for key, kind in (("methods", "model"), ("sizes", "variant")):
             known = config_names(kind)
             for name in _list(file, key, content[key], str):
@@ -100,17 +100,17 @@ class SearchSpace:
         for key in ("points", "photons"):
             has, most = getattr(self.spec, key), max(getattr(self, key))
             if most > has:
-                raise UserError(f"{file}: {key}: {most} is more than the {has} that the dataset has")
+                raise UserError(f"{file}: {key}: {most} is more than the {has} of the dataset")
         for split in ("train", "val", "test"):
             if self.spec.count(split) * len(self.spec.scenes) < 2:
-                raise UserError(f"{self.scale}: data.dataset.{split}: must be at least 2 to select, is fewer")
+                raise UserError(f"{self.scale}: data.dataset.{split}: must give at least 2 samples, gives fewer")
         steps = read_configs([str(self.scale)]).get("trainer", {}).get("max_steps")
         if not isinstance(steps, int) or steps < 1:
             raise UserError(f"{self.scale}: trainer.max_steps: must be a whole number of at least 1, is {steps!r}")
         for method in self.methods:
             kind = pydoc.locate(str(self._config(method, self.sizes[0])["model"].get("class_path")))
             if not (isinstance(kind, type) and issubclass(kind, RenderingModule)):
-                raise UserError(f"{file}: methods: {method} is not trained; give one that is")
+                raise UserError(f"{file}: methods: {method} is not trained; give a trained method")
 
     @cached_property
     def _loaded(self) -> tuple[DatasetSpec, AnyPath]:
@@ -118,36 +118,36 @@ class SearchSpace:
 
     @property
     def spec(self) -> DatasetSpec:
-        """Of the dataset."""
+        """The spec of the dataset."""
         return self._loaded[0]
 
     @property
     def root(self) -> AnyPath:
-        """Of datasets."""
+        """The root directory of datasets."""
         return self._loaded[1]
 
     @cached_property
     def candidates(self) -> list[Candidate]:
-        """The full model first, then so that the first few of them are spread over methods, sizes and counts."""
+        """All candidates, the full model first; any first few are spread over methods, sizes and counts."""
         columns = []
         for method in reversed(self.methods):
             inputs = self.build(Candidate(method, self.sizes[-1], None, None)).fields
             reads = lambda prefix, names=inputs: any(name.startswith(prefix) for name in names)
             points = self.points if reads("point_") else (None,)
             photons = self.photons if reads("photon_") else (None,)
-            found = list(itertools.product([method], self.sizes, points, photons))[::-1]
-            order = sorted(range(len(found)), key=lambda k: _van_der_corput(k, len(found)))
-            columns.append([Candidate(*found[k]) for k in order])
+            combinations = list(itertools.product([method], self.sizes, points, photons))[::-1]
+            order = sorted(range(len(combinations)), key=lambda k: _van_der_corput(k, len(combinations)))
+            columns.append([Candidate(*combinations[k]) for k in order])
         rows = itertools.zip_longest(*columns)
         return [candidate for row in rows for candidate in row if candidate]
 
     @property
     def full(self) -> Candidate:
-        """The largest."""
+        """The largest candidate."""
         return self.candidates[0]
 
     def config(self, candidate: Candidate) -> dict[str, Any]:
-        """What `nlt fit` is to be given to train a candidate."""
+        """Return the config with which `nlt fit` trains a candidate."""
         limits = {}
         if candidate.points not in (None, self.spec.points):
             limits["max_points"] = candidate.points
@@ -160,7 +160,7 @@ class SearchSpace:
         return read_configs([str(file) for file in files])
 
     def build(self, candidate: Candidate) -> RenderingModule:
-        """The candidate, untrained."""
+        """Return the candidate's untrained model."""
         model = self.config(candidate)["model"]
         kind: Any = pydoc.locate(model["class_path"])
         sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.points}
@@ -173,16 +173,16 @@ class SearchSpace:
 
 
 def _list(file: Path, key: str, value: Any, kind: type) -> list[Any]:
-    if not isinstance(value, list) or not value or any(type(each) is not kind for each in value):
-        what = "names" if kind is str else "whole numbers"
-        raise UserError(f"{file}: {key}: must be a list of {what}, is {value!r}")
+    if not isinstance(value, list) or not value or any(type(item) is not kind for item in value):
+        expected = "names" if kind is str else "whole numbers"
+        raise UserError(f"{file}: {key}: must be a list of {expected}, is {value!r}")
     if len(set(value)) < len(value):
-        raise UserError(f"{file}: {key}: has one twice: {value}")
+        raise UserError(f"{file}: {key}: must not have duplicates, is {value}")
     return value
 
 
 def _van_der_corput(k: int, count: int) -> int:
-    """A sort key by which the ends of 0..count-1 come first, then the middle, the quarters, and so on."""
+    """Return a sort key that puts the ends of 0..count-1 first, then the middle, the quarters, and so on."""
     if k in (0, count - 1):
         return -2 if k == 0 else -1
     bits = (count - 1).bit_length()

@@ -1,4 +1,4 @@
-"""The trainings of a space's candidates: each goes on from its checkpoint, and is scored; what was found is kept."""
+"""The trainings of a space's candidates: each resumes from its checkpoint and is scored, and its scores are kept."""
 
 from __future__ import annotations
 
@@ -25,49 +25,49 @@ from nlt.models.policy import Policy
 from nlt.select.space import Candidate, SearchSpace
 from nlt.training import newest_checkpoint, read_checkpoint
 
-SCORES = ("unbiased_mse", "mssim")  # the first decides where they disagree
+SCORES = ("unbiased_mse", "mssim")  # where they disagree, the first one decides
 _BATCH = 16
 
 now = time.perf_counter
-Scores = dict[str, list[float]]  # of every image, by the keys of SCORES
+Scores = dict[str, list[float]]  # for every image, by the keys of SCORES
 
 
 class Trials:
-    """Trainings in `directory`, a directory each by candidate and seed."""
+    """Trainings in `directory`, in a subdirectory for each candidate and seed."""
 
     def __init__(self, space: SearchSpace, dataset: Any, directory: Path, device: torch.device, policy: Policy) -> None:
         self.space, self.dataset, self.directory = space, dataset, directory
         self.device, self.policy = device, policy
 
     def split(self, name: str, inputs: tuple[str, ...] | None = None) -> LightTransportDataset:
-        """A split of the dataset."""
+        """Return a split of the dataset with the fields `inputs`; None for all."""
         return LightTransportDataset(self.dataset, self.space.spec, name, inputs)
 
     def train(self, candidate: Candidate, seed: int, steps: int, begun: int, step_s: float) -> dict[str, Any]:
-        """Train on from `begun` to `steps` and score on the validation split, or what is known of it.
+        """Train from `begun` to `steps` and score on the validation split, or read the stored result.
 
-        Returns `seconds`, and `scores` or, if it diverges, `diverged`. `step_s` stands for the steps that a killed
-        process has done: as if this one had done them all.
+        Returns `seconds`, and `scores` or, if the training diverges, `diverged`. Each step that a killed process has
+        already done counts as `step_s` seconds.
         """
         run = self.run_of(candidate, seed)
         record = run / f"{steps}.json"
         if not record.exists():
-            begin, found = now(), dict[str, Any]()
+            begin, result = now(), dict[str, Any]()
             try:
                 done = self._fit(run, candidate, seed, steps)
-                found["scores"] = self.score(candidate, seed, "val")
+                result["scores"] = self.score(candidate, seed, "val")
             except DivergedError as error:
-                done, found["diverged"] = steps - begun, str(error)
+                done, result["diverged"] = steps - begun, str(error)
             seconds = now() - begin + (steps - begun - done) * step_s
-            write_bytes(record, json.dumps({**found, "seconds": seconds}).encode())
+            write_bytes(record, json.dumps({**result, "seconds": seconds}).encode())
         return dict(json.loads(record.read_text()))
 
     def run_of(self, candidate: Candidate, seed: int) -> Path:
-        """The directory of a training."""
+        """Return the directory of a training."""
         return self.directory / f"{candidate.slug}-seed{seed}"
 
     def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
-        """Train up to `steps`; how many of them were done now."""
+        """Train up to `steps` and return how many of them were done now."""
         logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
         own = {
             "seed_everything": seed,
@@ -90,7 +90,7 @@ class Trials:
 
     @torch.inference_mode()
     def score(self, candidate: Candidate, seed: int, split: str) -> Scores:
-        """The scores of every image of a split.
+        """Return the scores of every image of a split.
 
         Raises:
             DivergedError: a prediction is not finite.
@@ -98,22 +98,22 @@ class Trials:
         checkpoint = newest_checkpoint(self.run_of(candidate, seed))
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
-        metrics, found = ImageMetrics(perceptual=False).to(self.device), []
+        metrics, batches = ImageMetrics(perceptual=False).to(self.device), []
         for cpu_batch in DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=identity_collate):
             batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
             with self.policy.applied(self.device):
                 prediction = module(batch)
             if not prediction.isfinite().all():
-                raise DivergedError(f"a prediction is not finite, among {split} samples {batch['index'].tolist()}")
-            found.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
-        return {key: torch.cat([each[key] for each in found]).tolist() for key in SCORES}
+                raise DivergedError(f"a prediction is not finite among {split} samples {batch['index'].tolist()}")
+            batches.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
+        return {key: torch.cat([scores[key] for scores in batches]).tolist() for key in SCORES}
 
     def scores(self, candidate: Candidate, key: str, seeds: Sequence[int], steps: int) -> np.ndarray:
-        """(S, N) on the validation split: seeds and images."""
-        found = [json.loads((self.run_of(candidate, s) / f"{steps}.json").read_text()) for s in seeds]
-        return np.array([each["scores"][key] for each in found])
+        """Return validation scores (S, N), seeds by images."""
+        results = [json.loads((self.run_of(candidate, s) / f"{steps}.json").read_text()) for s in seeds]
+        return np.array([result["scores"][key] for result in results])
 
 
 def as_error(key: str, scores: np.ndarray) -> np.ndarray:
-    """Scores so that lower is better."""
+    """Return scores turned into errors, of which lower is better."""
     return scores if METRICS[key].direction == "lower" else 1 - scores

@@ -1,1 +1,1 @@
-"""`nlt stress`: where methods break."""
+"""`nlt stress`: the severity of a change at which each trained method breaks."""

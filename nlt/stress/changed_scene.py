@@ -1,8 +1,8 @@
-"""A scene with other meshes, surfaces or lights than its file's: what the stress suites do to the scene itself.
+"""Scenes with other meshes, surfaces or lights than their files': the stress suites' changes of the scene itself.
 
-The point cloud stays that of training, row by row, for what is learned of a point belongs to its row. What a renderer
-knows of a point is brought up to date: where it is, its albedo, material and emission. The points of a mesh that is
-replaced lie on the new one, uniform by area; of a second light, every other point of the first lies on it.
+The point cloud keeps training's rows, because a learned embedding belongs to a row. The attributes that a renderer
+knows are updated: position, albedo, material and emission. The points of a replaced mesh lie on the new mesh, uniformly
+by area. Every other point of the moving light moves to the second light.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from nlt.scenes.model import Triangles
 from nlt.scenes.pointcloud import material, surface, uniform_points
 
 _SECOND_LIGHT = "second_light"
-_BELOW = 0.02  # metres: a second light below the first one's height, so that the two never coincide
+_BELOW = 0.02  # metres from a second light up to the first one's height, so that the two never coincide
 _METAL = 0.9  # reflectance
-_SPARE = 0.7  # of the scene's diagonal: a shape as large is the room, where nothing says what an object is
+_ROOM_SIZE = 0.7  # share of the scene's diagonal; without movable objects, a larger shape is not an object
 
 
 class ChangedScene(Scene):
-    """A scene with other meshes, surfaces or lights than its file's: `change` (of `MESHES`) at `value`."""
+    """A scene with one change, a key of `MESHES`, at `value`."""
 
     def __init__(
         self, description: SceneDescription, experiment: str, change: str, value: float, points: Points, seed: int
     ) -> None:
         self._change, self._value, self._points = change, value, points
         self._touched: frozenset[str] = frozenset()  # shapes whose points change
-        self._axes: dict[str, np.ndarray] = {}  # where those that get thinner have their object's middle
-        self._second = np.zeros(3)  # from the moving light at rest to the second one
+        self._axes: dict[str, np.ndarray] = {}  # by thinned shape, the middle of its object
+        self._second = np.zeros(3)  # offset from the moving light at rest to the second one
         self.rng = np.random.default_rng(seed)
         super().__init__(description, experiment)
 
@@ -44,34 +44,34 @@ class ChangedScene(Scene):
         self._names = list(meshes)
         changed = MESHES[self._change](self, meshes, self._value)
         units = self.description.units_per_metre
-        # Nothing may be left alive of the surfaces that are gone: kernels would be compiled with them.
+        # Drop the replaced surfaces entirely: kernels would be compiled with any that stay alive.
         self.shapes |= {name: read_shape(mesh, units, False) for name, mesh in changed.items() if name in meshes}
         super()._assemble(meshes | changed)
 
     def objects(self, meshes: dict[str, Any]) -> list[list[str]]:
-        """The shapes of each object that can be changed: none emits. Without movable objects, each shape is one."""
+        """Return the shapes of each object that can change and does not emit; without movables, each shape is one."""
         groups = [list(movable.shapes) for movable in self.movables if movable.name != MOVING_LIGHT]
         if not groups:
             low, high = (np.array([f(s.vertices, 0) for s in self.shapes.values()]) for f in (np.min, np.max))
             whole = np.linalg.norm(high.max(0) - low.min(0))
-            small = np.linalg.norm(high - low, axis=1) < _SPARE * whole
+            small = np.linalg.norm(high - low, axis=1) < _ROOM_SIZE * whole
             groups = [[name] for name, is_small in zip(self.shapes, small, strict=True) if is_small]
         groups = [[name for name in group if not meshes[name].is_emitter()] for group in groups]
         return [group for group in groups if group]
 
     def some_objects(self, meshes: dict[str, Any], share: float) -> list[str]:
-        """The shapes of a share of the objects, the same ones and more at a larger share."""
+        """Return the shapes of a share of the objects; a larger share includes those of a smaller one."""
         groups = self.objects(meshes)
         order = self.rng.permutation(len(groups))[: max(1, round(share * len(groups)))]
         return [name for k in order for name in groups[k]]
 
     def mean_albedo(self, name: str) -> np.ndarray:
-        """(3,) of a shape, by its points; grey where it has none."""
+        """Return the mean albedo (3,) of a shape's points; grey where it has none."""
         mine = self._points["shape"] == self._names.index(name)
         return self._points["albedo"][mine].mean(0) if mine.any() else np.full(3, 0.5)
 
     def moved_points(self, points: Points) -> Points:
-        """Training's points as a renderer of this scene knows them."""
+        """Return training's points with the attributes of this scene."""
         points = {name: array.copy() for name, array in points.items()}
         for k, name in enumerate(self._names):
             mine, shape = np.flatnonzero(points["shape"] == k), self.shapes[name]
@@ -95,19 +95,19 @@ class ChangedScene(Scene):
         return points
 
     def surfaces(self, meshes: dict[str, Any], bsdfs: dict[str, Any]) -> dict[str, Any]:
-        """The meshes of these shapes with other BSDFs."""
+        """Return the meshes of these shapes with new BSDFs."""
         self._touched = frozenset(bsdfs)
-        live = {str(bsdf): mi.load_dict(bsdf) for bsdf in bsdfs.values()}  # equal ones share one
+        live = {str(bsdf): mi.load_dict(bsdf) for bsdf in bsdfs.values()}  # equal BSDFs share an instance
         return {name: live_mesh(name, read_triangles(meshes[name]), live[str(bsdf)]) for name, bsdf in bsdfs.items()}
 
     def _thin(self, position: np.ndarray, name: str) -> np.ndarray:
-        """Drawn towards its object's vertical axis; metres."""
+        """Return positions in metres, drawn towards the vertical axis of the shape's object."""
         across = np.where(self.description.up == 0, self._value, 1.0)
         return (position - self._axes[name]) * across + self._axes[name]
 
 
 def _roughness(scene: ChangedScene, meshes: dict[str, Any], alpha: float) -> dict[str, Any]:
-    """Every object of one surface: 1 is diffuse, 0 a mirror, between them rough metal."""
+    """Give every object the same surface: 1 is diffuse, 0 a mirror, values between are rough metal."""
     names = scene.some_objects(meshes, 1)
     if alpha == 1:
         return scene.surfaces(meshes, {name: _diffuse(scene.mean_albedo(name)) for name in names})
@@ -117,7 +117,7 @@ def _roughness(scene: ChangedScene, meshes: dict[str, Any], alpha: float) -> dic
 
 
 def _albedo(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
-    """Every shape of an object diffuse, its mean albedo mixed with a saturated colour drawn for it."""
+    """Make every shape of an object diffuse, its mean albedo mixed with a random saturated colour."""
     bsdfs = {}
     for name in scene.some_objects(meshes, 1):
         colour = np.where(np.eye(3)[scene.rng.integers(3)] > 0, 0.9, 0.05)
@@ -126,13 +126,13 @@ def _albedo(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[s
 
 
 def _glass(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
-    """A share of the objects of glass."""
+    """Turn a share of the objects into glass."""
     names = scene.some_objects(meshes, share)
     return scene.surfaces(meshes, {name: {"type": "dielectric", "int_ior": 1.5} for name in names})
 
 
 def _replaced(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
-    """Every shape of a share of the objects gives way to a knot that fills its bounding box, of its surface."""
+    """Replace every shape of a share of the objects by a knot with its bounding box and BSDF."""
     names, knot, changed = scene.some_objects(meshes, share), _knot(), {}
     scene._touched = frozenset(names)
     for name in names:
@@ -143,7 +143,7 @@ def _replaced(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict
 
 
 def _thinner(scene: ChangedScene, meshes: dict[str, Any], factor: float) -> dict[str, Any]:
-    """Every object drawn towards its vertical axis."""
+    """Draw every object towards its vertical axis."""
     changed = {}
     for group in scene.objects(meshes):
         vertices = np.concatenate([scene.shapes[name].vertices for name in group])
@@ -158,7 +158,7 @@ def _thinner(scene: ChangedScene, meshes: dict[str, Any], factor: float) -> dict
 
 
 def _second_light(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
-    """A share of the power from a second light, in a corner of the first one's box."""
+    """Give a share of the power to a second light in a corner of the first one's box."""
     light, up = scene.description.light, scene.description.up
     assert light is not None
     scene.description = dataclasses.replace(
@@ -188,7 +188,7 @@ def _diffuse(albedo: np.ndarray) -> dict[str, Any]:
 
 
 def _knot(along: int = 96, around: int = 12) -> Triangles:
-    """A tube around a trefoil knot, in the unit cube."""
+    """Return a tube around a trefoil knot, in the unit cube."""
     t, s = (g.ravel() for g in np.meshgrid(*(2 * np.pi * np.arange(n + 1) / n for n in (along, around)), indexing="ij"))
     curve = lambda t: np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], 1)
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)

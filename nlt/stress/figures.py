@@ -1,4 +1,4 @@
-"""The stress suites in pictures: curves, heat map, gallery; and the words beside them."""
+"""The figures and the report section of the stress suites: curves, heat map, gallery."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import IMAGES, MANIFEST
-from nlt.report.figures import COLOURS, DASHES, MARKERS, grid, save, shown
+from nlt.report.figures import COLOURS, DASHES, MARKERS, PICTURE, grid, save, shown
 from nlt.report.page import Section
 from nlt.stress.suites import RENDERED
 from nlt.stress.tables import (
@@ -34,12 +34,12 @@ from nlt.stress.tables import (
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-_CEILING = 1e3  # where curves end
+_CEILING = 1e3  # growth at which curves are clipped
 _WORST = 8  # rows of the gallery
 
 
 def draw_stress(directory: Path) -> None:
-    """breaking.csv, stress.md and the figures, from the rows in a directory; nothing where there are none."""
+    """Write breaking.csv, stress.md and the figures from a directory's rows; do nothing where there are none."""
     stressed = load_stress(directory)
     if stressed is None:
         return
@@ -51,7 +51,7 @@ def draw_stress(directory: Path) -> None:
 
 
 def stress_section(results: Path) -> Section | None:
-    """Draw the stress suites of a comparison's results, and return their section of its report; None without any."""
+    """Draw the stress suites of a comparison's results and return their report section; None without results."""
     directory = results / STRESS
     draw_stress(directory)
     stressed = load_stress(directory)
@@ -64,7 +64,7 @@ def stress_section(results: Path) -> Section | None:
 
 
 def _curves(stressed: Stressed) -> None:
-    """stress_curves: growth of the error over severity, a panel per ladder, on one scale."""
+    """Draw stress_curves: the growth of the error over severity, one panel per ladder, on one scale."""
     columns = 6
     count = math.ceil(len(stressed.ladders) / columns)
     figure, axes = plt.subplots(
@@ -87,16 +87,16 @@ def _curves(stressed: Stressed) -> None:
         axis.tick_params(labelsize=7, labelbottom=True)
         axis.grid(alpha=0.3)
     figure.supylabel("error over clean error, by severity", fontsize=8)
-    found = {
+    handles = {
         label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(found.values(), found.keys(), loc="lower center", ncols=7, fontsize=7, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=7, fontsize=7, frameon=False)
     figure.tight_layout(rect=(0.01, 0.15 / count + 0.01, 1, 1))
     save(figure, stressed.directory, "stress_curves")
 
 
 def _heat_map(stressed: Stressed) -> None:
-    """stress_map: the breaking point of every method on every ladder; darker is earlier, blank is not concerned."""
+    """Draw stress_map: each method's breaking point on each ladder; darker is earlier, blank is not affected."""
     methods, ladders = stressed.methods, stressed.ladders
     points = np.full((len(ladders), len(methods)), np.nan)
     highest = np.full(len(ladders), 5)
@@ -119,9 +119,11 @@ def _heat_map(stressed: Stressed) -> None:
 
 
 def _gallery(stressed: Stressed) -> None:
-    """stress_worst: the views whose error grew most at a ladder's highest severity: reference and every method, the
-    one whose error grew so framed."""
-    found = []
+    """Draw stress_worst: the views whose error grew most at a ladder's highest severity, by reference and every method.
+
+    The method whose error grew most is framed.
+    """
+    candidates = []
     for ladder in stressed.ladders:
         if ladder[0] not in RENDERED:
             continue
@@ -129,15 +131,15 @@ def _gallery(stressed: Stressed) -> None:
             rows = [r for r in stressed.rows if (r["method"], r["suite"], r["ladder"]) == (method, *ladder)]
             top = [row for row in rows if row["severity"] == max(r["severity"] for r in rows)]
             for place, row in enumerate(top):
-                found.append((row["error"] / stressed.clean(method), ladder, place, method))
+                candidates.append((row["error"] / stressed.clean(method), ladder, place, method))
     chosen: dict[tuple[str, str], tuple[float, int, str]] = {}
-    for growth, ladder, place, method in sorted(found, reverse=True):
+    for growth, ladder, place, method in sorted(candidates, reverse=True):
         chosen.setdefault(ladder, (growth, place, method))
     picked = sorted(chosen.items(), key=lambda item: -item[1][0])[:_WORST]
     suites = {ladder[0] for ladder, _ in picked}
     stored = {(s, m): _images(stressed, s, m) for s in suites for m in ("reference", *stressed.methods)}
     if not picked or not all(stored[suite, "reference"] for suite in suites):
-        return  # images stay on the machine that made them
+        return  # images exist only on the machine that made them
     methods = [m for m in stressed.methods if all(stored[suite, m] for suite in suites)]
     figure, axes = grid(len(picked), ["Reference", *(label(m) for m in methods)])
     for row, ((suite, name), (growth, place, worst)) in zip(axes, picked, strict=True):
@@ -151,7 +153,7 @@ def _gallery(stressed: Stressed) -> None:
             0.02, 0.03, f"{fill(stressed.says((suite, name)), 18)}\n{growth:.3g}x", transform=row[0].transAxes,
             fontsize=6, color="white", bbox={"facecolor": "black", "alpha": 0.6, "pad": 1, "lw": 0},
         )  # fmt: skip
-    save(figure, stressed.directory, "stress_worst", ("png",))
+    save(figure, stressed.directory, "stress_worst", PICTURE)
 
 
 def _images(stressed: Stressed, suite: str, method: str) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What the stress suites make of rendered views without rendering: fewer inputs, another frame of the world."""
+"""Stress changes that need no rendering: fewer inputs, or another coordinate frame of the world."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlt.data.sample import BATCH_FIELDS, FIELDS
 from nlt.models.method import Batch
 
-_IMAGES = ("reference_a", "reference_b", "noisy", "noisy_input", "depth", "normal", "albedo", "view_direction")
+_IMAGES = tuple(name for name, field in (FIELDS | BATCH_FIELDS).items() if field.shape[1:] == ("H", "W"))
 
 
 def _points(batch: Batch, share: float) -> Batch:
-    """The first of the points, which are in random order; the others are not visible."""
+    """Keep the first points, which are in random order, and mark the others as not visible."""
     count = batch["point_visible"].shape[1]
     first = torch.arange(count, device=batch["point_visible"].device) < max(1, round(share * count))
     return batch | {"point_visible": batch["point_visible"] & first}
 
 
 def _photons(batch: Batch, share: float) -> Batch:
-    """Photons at equal distances in their list, which goes by emitter; together they carry the power of all."""
+    """Keep photons at equal strides in their list, which is sorted by emitter; the total power stays the same."""
     total = batch["photon_flux"].shape[1]
     count = round(share * total)
     chosen = ((torch.arange(count, device=batch["photon_flux"].device) + 0.5) * (total / max(count, 1))).long()
@@ -30,7 +31,7 @@ def _photons(batch: Batch, share: float) -> Batch:
 
 
 def _spp(batch: Batch, spp: float) -> Batch:
-    """So many samples per input pixel on average: those pixels that get one more are spread at random."""
+    """Give input pixels `spp` samples on average; the pixels with one sample more are random."""
     less, more = int(np.floor(spp)), int(np.ceil(spp))
     image = batch["noisy_input"]
     chosen = torch.rand(image.shape[-2:], generator=torch.Generator().manual_seed(0)).to(image.device) < spp - less
@@ -38,7 +39,7 @@ def _spp(batch: Batch, spp: float) -> Batch:
 
 
 def _moved(batch: Batch, rotation: Tensor, translation: Tensor) -> Batch:
-    """Scene and camera under the rigid motion x -> R x + t; what the camera sees is the same."""
+    """Apply the rigid motion x -> R x + t to scene and camera, which leaves the image the same."""
     back = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
     back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ translation
     changed = {"world_to_view": batch["world_to_view"].to(back.dtype) @ back}
@@ -56,7 +57,7 @@ def _shifted(batch: Batch, metres: float, up: Tensor, middle: Tensor) -> Batch:
 
 
 def _turned(batch: Batch, degrees: float, up: Tensor, middle: Tensor) -> Batch:
-    """About the vertical through the middle of the camera's box (Rodrigues' formula)."""
+    """Turn about the vertical through the middle of the camera's box (Rodrigues' formula)."""
     angle = torch.tensor(np.radians(degrees), device=up.device)
     cross = torch.linalg.cross(torch.diag(torch.ones_like(up)), up.expand(3, 3), dim=1)
     rotation = torch.eye(3, dtype=up.dtype, device=up.device) + angle.sin() * cross + (1 - angle.cos()) * cross @ cross
@@ -64,7 +65,7 @@ def _turned(batch: Batch, degrees: float, up: Tensor, middle: Tensor) -> Batch:
 
 
 def _mirrored(batch: Batch, _: float, up: Tensor, middle: Tensor) -> Batch:
-    """Every image the other way round, and the camera's matrix so that points fall where they are seen."""
+    """Mirror every image, and the camera's matrix so that points fall on the pixels where they are visible."""
     width = batch["depth"].shape[-1]
     flip = torch.tensor([[-1.0, 0, width], [0, 1, 0], [0, 0, 1]], device=batch["depth"].device)
     images = {name: value.flip(-1) for name, value in batch.items() if name in _IMAGES or "traced_" in name}

@@ -1,4 +1,4 @@
-"""What the stress suites do to light, state and camera of a test view, in the scene as it is."""
+"""The stress suites' changes of a test view's light, state and camera, in an unchanged scene."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from nlt.scenes.description import MOVING_LIGHT
 from nlt.scenes.lanes import is_jit
 from nlt.scenes.state import SceneState
 
-_RED = np.array([2.4, 0.4, 0.2])  # of the same mean as white
-_NEAR_FROM, _GRAZING_AT = 1.0, 0.75  # metres: points are looked for beyond; grazed from
+_RED = np.array([2.4, 0.4, 0.2])  # same mean as white
+_NEAR_FROM, _GRAZING_AT = 1.0, 0.75  # metres: least distance of a chosen point; distance of a grazing view
 _TRIES = 200
 
 
 class ViewPerturber:
-    """The test views of a scene, as they are or changed: `place` one, then render it."""
+    """The test views of a scene, unchanged or changed: `place` one, then render it."""
 
     def __init__(self, render: SampleRenderer, points: Points, seed: int) -> None:
         self.render, self.scene, self.points, self._seed = render, render.scene, points, seed
@@ -37,11 +37,11 @@ class ViewPerturber:
             self._emitter.keep([f"emitter_{MOVING_LIGHT}.emitter.radiance.value"])
 
     def place(self, index: int, change: str | None = None, value: float = 0.0) -> Camera:
-        """Put the scene into the state of a test sample, with the change (of `PLACES`); the camera."""
+        """Put the scene into a test sample's state, with a change (a key of `PLACES`), and return the camera."""
         self.rng = np.random.default_rng([self._seed, self.render.index, index])
         self.light_size, self.light_gain = 1.0, np.ones(3)
         if self._lit:
-            self._set_light()  # before a view is chosen, for the light may be before the lens
+            self._set_light()  # before a view is chosen, because the light may hide it
         self.camera = self.render.place("test", index)
         if change is not None:
             PLACES[change](self, value)
@@ -64,7 +64,7 @@ class ViewPerturber:
         self._emitter.update()
 
     def lit_points(self) -> Points:
-        """Training's points under the light as it is now."""
+        """Return training's points under the current light."""
         if self.light_size == 1 and (self.light_gain == 1).all():
             return self.points
         points = {name: array.copy() for name, array in self.points.items()}
@@ -74,22 +74,22 @@ class ViewPerturber:
         points["emission"][lit] *= self.light_gain.astype(np.float32)
         return points
 
-    # --- what changes are made of ---
+    # --- the parts of changes ---
 
     def move(self, translation: np.ndarray, present: np.ndarray) -> None:
-        """Another state; another camera where the old one no longer shows the room."""
+        """Set another state, and another camera where the old one no longer shows the room."""
         translation = np.where(present[:, None], translation, 0).astype(np.float32)
         self.scene.set_state(SceneState(translation, present))
         if not self.render.views.passes(self.camera):
             self.camera = self.render.views.sample(self.camera.height, self.rng)
 
     def look(self, position: np.ndarray, target: np.ndarray) -> None:
-        """The camera elsewhere, of the same lens."""
+        """Move the camera to a position and aim it at a target, with the same lens."""
         camera, up = self.camera, self._description.up
         self.camera = Camera.look_at(position, target, up, camera.fov, camera.width, camera.height)
 
     def lens(self, fov: float | None = None, width: float | None = None, height: float | None = None) -> None:
-        """Another horizontal field of view, in degrees, or image size."""
+        """Set another horizontal field of view, in degrees, or image size."""
         old = self.camera
         width, height = max(1, round(width or old.width)), max(1, round(height or old.height))
         focal = width / 2 / np.tan(np.radians(fov or old.fov) / 2)
@@ -97,20 +97,24 @@ class ViewPerturber:
         self.camera = Camera(matrix, old.world_to_view, width, height)
 
     def sees(self, eye: np.ndarray, target: np.ndarray) -> bool:
-        """Nothing lies between them, and the view is not straight up or down."""
+        """Return whether nothing lies between eye and target and the view is not straight up or down."""
         reach = np.linalg.norm(target - eye)
         direction = (target - eye) / reach
         distance, *_ = self.render.views.look(eye, direction[None])
         return bool(abs(distance[0] - reach) < 1e-2 * reach) and abs(direction @ self._description.up) < 0.99
 
     def surface_points(self) -> Iterator[np.ndarray]:
-        """Points (3,) that the camera sees from a metre or more, those of objects first, in random order."""
+        """Yield points (3,) that the camera sees from a metre or more, those of objects first, in random order.
+
+        Raises:
+            UserError: the camera sees none of the points.
+        """
         state = self.scene.state
         owner = self.points["object"]
-        position, there = place_points(self.points, state.translation, state.present)
-        of_objects = np.concatenate([self.objects, [False]])[owner]
+        position, present = place_points(self.points, state.translation, state.present)
+        on_objects = np.concatenate([self.objects, [False]])[owner]
         eye, tried = self.camera.position, 0
-        for candidates in (np.flatnonzero(there & of_objects), np.flatnonzero(there & (owner < 0))):
+        for candidates in (np.flatnonzero(present & on_objects), np.flatnonzero(present & (owner < 0))):
             for k in self.rng.permutation(candidates)[: _TRIES // 2]:
                 tried += 1
                 if np.linalg.norm(position[k] - eye) >= _NEAR_FROM and self.sees(eye, position[k]):
@@ -118,7 +122,7 @@ class ViewPerturber:
         raise UserError(f"{self._description.file}: none of {tried} points is seen from a test view's camera")
 
     def largest(self, among: np.ndarray) -> int:
-        """The movable with the most points among some (M,) bool."""
+        """Return the movable with the most points out of those in `among` (M,) bool."""
         owner = self.points["object"]
         return int(np.where(among, np.bincount(owner[owner >= 0], minlength=len(among)), -1).argmax())
 
@@ -129,13 +133,13 @@ class ViewPerturber:
 
     @property
     def middle(self) -> np.ndarray:
-        """(3,) of the room, or of the camera's box."""
+        """The middle (3,) of the room, or of the camera's box where no room is given."""
         room = self._description.room
         return (self._description.camera if room is None else room).mean(0)
 
 
 def _light_lowered(perturber: ViewPerturber, metres: float) -> None:
-    """Under the bottom of its box."""
+    """Lower the light by `metres` under the bottom of its box."""
     state, light, up = perturber.scene.state, len(perturber.objects) - 1, perturber._description.up
     box = perturber.scene.movables[light].box
     moved = state.translation.astype(float)
@@ -144,12 +148,12 @@ def _light_lowered(perturber: ViewPerturber, metres: float) -> None:
 
 
 def _light_size(perturber: ViewPerturber, factor: float) -> None:
-    """Its sides times `factor`, its power as it was."""
+    """Scale the light's sides by `factor`, at the same power."""
     perturber.light_size, perturber.light_gain = factor, np.full(3, factor**-2.0)
 
 
 def _light_colour(perturber: ViewPerturber, share: float) -> None:
-    """Mixed with red of the same mean."""
+    """Mix the light with red of the same mean."""
     perturber.light_gain = 1 - share + share * _RED
 
 
@@ -158,14 +162,14 @@ def _light_power(perturber: ViewPerturber, factor: float) -> None:
 
 
 def _turned_from_light(perturber: ViewPerturber, degrees: float) -> None:
-    """The camera turned about the vertical, until it looks so far past the light in azimuth."""
+    """Turn the camera about the vertical until its azimuth is `degrees` away from the light's."""
     (first, second), up = perturber.horizontal, perturber._description.up
     state, light = perturber.scene.state, perturber._description.light
     assert light is not None
     eye, ahead = perturber.camera.position, perturber.camera.rotation[:, 2]
     to_light = light.centre + state.translation[-1] - eye
     level, sign = np.sqrt(1 - (ahead @ up) ** 2), perturber.rng.choice([-1, 1])
-    for side in (sign, -sign):  # the other way round where that is what shows the room
+    for side in (sign, -sign):  # the other side if the first one does not show the room
         azimuth = np.arctan2(to_light[second], to_light[first]) + np.radians(degrees) * side
         direction = (ahead @ up) * up
         direction[[first, second]] = level * np.array([np.cos(azimuth), np.sin(azimuth)])
@@ -175,7 +179,7 @@ def _turned_from_light(perturber: ViewPerturber, degrees: float) -> None:
 
 
 def _object_outside(perturber: ViewPerturber, metres: float) -> None:
-    """The largest object, by its points, beyond the horizontal side of its box that faces the room's middle."""
+    """Move the object with the most points out of its box, horizontally towards the room's middle."""
     state = perturber.scene.state
     k = perturber.largest(
         perturber.objects & state.present if (perturber.objects & state.present).any() else perturber.objects
@@ -190,7 +194,7 @@ def _object_outside(perturber: ViewPerturber, metres: float) -> None:
 
 
 def _objects_removed(perturber: ViewPerturber, share: float) -> None:
-    """A share of all objects, the same ones and more at a larger share; the others as they were."""
+    """Remove a share of all objects; a larger share includes the objects of a smaller one."""
     state, objects = perturber.scene.state, np.flatnonzero(perturber.objects)
     present = state.present.copy()
     present[perturber.rng.permutation(objects)[: round(share * len(objects))]] = False
@@ -198,7 +202,7 @@ def _objects_removed(perturber: ViewPerturber, share: float) -> None:
 
 
 def _objects_crowded(perturber: ViewPerturber, share: float) -> None:
-    """Every object present, and by this share of the way where the room's middle is."""
+    """Make every object present and move it this share of the way to the room's middle."""
     state = perturber.scene.state
     moved, present = state.translation.astype(float), state.present | perturber.objects
     for k in np.flatnonzero(perturber.objects):
@@ -208,14 +212,14 @@ def _objects_crowded(perturber: ViewPerturber, share: float) -> None:
 
 
 def _near(perturber: ViewPerturber, metres: float) -> None:
-    """A point of an object from so near, in the same direction."""
+    """Look at a point of an object from `metres` away, in the same direction."""
     target = next(perturber.surface_points())
     direction = target - perturber.camera.position
     perturber.look(target - metres * direction / np.linalg.norm(direction), target)
 
 
 def _grazing(perturber: ViewPerturber, degrees: float) -> None:
-    """A point from 75 cm, at this angle to its surface."""
+    """Look at a point from 75 cm away, at this angle to its surface."""
     eye, up = perturber.camera.position, perturber._description.up
     for target in perturber.surface_points():
         ray = Camera.look_at(eye, target, up, 1.0, 1, 1)
@@ -239,7 +243,7 @@ def _field_of_view(perturber: ViewPerturber, degrees: float) -> None:
 
 
 def _corner(perturber: ViewPerturber, metres: float) -> None:
-    """So far from an edge between two walls, at the camera's height, the room's middle in view."""
+    """Put the camera this far from both walls of a corner, at its height, aimed at the room's middle."""
     room, position = perturber._description.room, perturber.camera.position
     assert room is not None
     a, b = perturber.horizontal
@@ -262,7 +266,7 @@ def _resolution(perturber: ViewPerturber, factor: float) -> None:
 
 
 def _aspect(perturber: ViewPerturber, ratio: float) -> None:
-    """So many times as wide as high, of as many pixels."""
+    """Make the image `ratio` times as wide as high, with as many pixels."""
     perturber.lens(width=perturber.camera.width * ratio**0.5, height=perturber.camera.height / ratio**0.5)
 
 
@@ -287,7 +291,7 @@ _NEEDS_OBJECTS = ("object_outside", "objects_removed", "objects_crowded")
 
 
 def lacks(spec: DatasetSpec, scene: int, change: str) -> str | None:
-    """What a change needs and a scene does not have."""
+    """Return what a change needs and a scene lacks; None if the change is possible."""
     description = spec.descriptions[scene]
     if change in _NEEDS_LIGHT and spec.experiment != "moving_lights":
         return "a moving light"
@@ -302,10 +306,10 @@ def lacks(spec: DatasetSpec, scene: int, change: str) -> str | None:
 
 
 def path(perturber: ViewPerturber, kind: str, length: float, frames: int) -> Iterator[Camera]:
-    """Put the scene into the frames of a smooth path, one after the other; their cameras.
+    """Put the scene into each frame of a smooth path in turn, and yield the frame's camera.
 
-    The camera goes `length` metres to its right, the light or the largest object `length` of its box along the box's
-    longest side, both about where the first test sample has them.
+    The camera moves `length` metres to its right, centred on its place in the first test sample. The light or the
+    largest object moves along the longest side of its box, by `length` times that side, centred on the box.
     """
     camera = perturber.place(0)
     state = perturber.scene.state

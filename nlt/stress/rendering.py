@@ -1,4 +1,4 @@
-"""Rendering the stress suites of a dataset, and reading them: a file per ladder, severity and scene."""
+"""Rendering and reading the stress suites of a dataset, in a file per ladder, severity and scene."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from nlt.stress.perturber import ViewPerturber, lacks, path
 from nlt.stress.suites import CLEAN, FLICKER, PATHS, RENDERED, Suites
 
 DRAWS, PATH = "draws", "path"
-FEWER_SPP = (1, 2, 3)  # per input pixel, of the clean views
+FEWER_SPP = (1, 2, 3)  # samples per input pixel that the clean views are also rendered at
 _DRAWN = ("noisy_input", "photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid")
 
 
@@ -60,58 +60,60 @@ class ViewSet:
 
 
 def view_sets(spec: DatasetSpec, suites: Suites, wanted: list[str]) -> list[ViewSet]:
-    """Everything to render for the suites `wanted`; the clean views come with any of them."""
-    flicker, found = suites.content[FLICKER], []
+    """Return everything to render for the suites `wanted`, always with the clean views."""
+    flicker, sets = suites.content[FLICKER], []
     views = min(suites.views, spec.test)
     for scene in range(len(spec.scenes)):
-        found.append(ViewSet(scene, CLEAN, "views", 0, views=views))
+        sets.append(ViewSet(scene, CLEAN, "views", 0, views=views))
         for ladder in suites.ladders:
             if ladder.suite in RENDERED and ladder.suite in wanted and not lacks(spec, scene, ladder.change):
-                found += [
+                sets += [
                     ViewSet(scene, ladder.suite, ladder.name, severity, ladder.change, value, views)
                     for severity, value in enumerate(ladder.values, 1)
                 ]
         if FLICKER in wanted:
-            found += [ViewSet(scene, FLICKER, DRAWS, k + 1, views=views) for k in range(flicker["draws"])]
+            sets += [ViewSet(scene, FLICKER, DRAWS, k + 1, views=views) for k in range(flicker["draws"])]
             for kind in PATHS:
                 if not (kind == "object" and lacks(spec, scene, "object_outside")) and not (
                     kind == "light" and lacks(spec, scene, "light_lowered")
                 ):
-                    found.append(ViewSet(scene, FLICKER, kind, 0, PATH, flicker[kind], flicker["frames"]))
-    return found
+                    sets.append(ViewSet(scene, FLICKER, kind, 0, PATH, flicker[kind], flicker["frames"]))
+    return sets
 
 
 def render_suites(
     spec: DatasetSpec, dataset: AnyPath, suites: Suites, wanted: list[str], root: str | AnyPath
 ) -> AnyPath:
-    """Render what is missing of the suites `wanted` and return their directory.
+    """Render the missing views of the suites `wanted` and return their directory.
 
     Raises:
         UserError: a scene is wrong, or a worker failed twice.
     """
     directory = suites.directory(spec, root)
-    there = list_files(directory) if directory.exists() else set()
-    missing = [view_set for view_set in view_sets(spec, suites, wanted) if view_set.name not in there]
+    existing = list_files(directory) if directory.exists() else set()
+    missing = [view_set for view_set in view_sets(spec, suites, wanted) if view_set.name not in existing]
     if not missing:
         return directory
-    total, died = sum(view_set.views for view_set in missing), dict[tuple[ViewSet, ...], str]()
+    total, failures = sum(view_set.views for view_set in missing), dict[tuple[ViewSet, ...], str]()
     print(f"{directory}: {total} views of {len(missing)} sets to render", flush=True)
     work = partial(_render, spec, suites, str(dataset), str(directory), choose_variant().name)
     with (
         tqdm(total=total, unit="view", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(Local(available_cpus(), preload=(SampleTensors.__module__,)).run(work, _jobs(missing), died)) as ticks,
+        closing(
+            Local(available_cpus(), preload=(SampleTensors.__module__,)).run(work, _jobs(missing), failures)
+        ) as ticks,
     ):
         for ticked in ticks:
             bar.update((ticked or 0) - bar.n)
-    for job, reason in died.items():
-        raise UserError(f"{directory / job[0].name}: a worker that rendered it died twice ({reason})")
+    for job, reason in failures.items():
+        raise UserError(f"{directory / job[0].name}: the worker that rendered it died twice ({reason})")
     return directory
 
 
 def _jobs(missing: list[ViewSet]) -> list[tuple[ViewSet, ...]]:
-    """View sets that one process renders: loading a scene costs as much as a few views.
+    """Group the view sets by process, because loading a scene costs as much as a few views.
 
-    A scene that is changed has a process of its own, for Mitsuba cannot forget the one before.
+    A changed scene has a process of its own, because Mitsuba does not release the scene before it.
     """
     changed = [(view_set,) for view_set in missing if view_set.change in MESHES]
     plain: dict[int, list[ViewSet]] = {}
@@ -158,11 +160,11 @@ def _render(
 def _samples(
     perturber: ViewPerturber, suites: Suites, view_set: ViewSet, seeds: list[np.random.SeedSequence]
 ) -> Iterator[Points]:
-    """The views of a set, with everything that a method may read and what methods without training are given."""
+    """Yield the views of a set, with all fields that methods read and the renderings for methods without training."""
     render = perturber.render
     if view_set.ladder == DRAWS:
-        for k, one in enumerate(seeds):
-            yield render.view(perturber.place(k), one, _DRAWN)
+        for k, view_seed in enumerate(seeds):
+            yield render.view(perturber.place(k), view_seed, _DRAWN)
         return
     change = None if view_set.change in MESHES else view_set.change
     cameras: Iterator[Camera] = (perturber.place(k, change, view_set.value) for k in range(view_set.views))
@@ -171,15 +173,15 @@ def _samples(
     spp = {f"traced_{count}": count for count in suites.content["traced"]}
     if view_set.suite == CLEAN:
         spp |= {f"input_{count}": count for count in FEWER_SPP}
-    for camera, one in zip(cameras, seeds, strict=True):
-        sample = render.view(camera, one, render.spec.fields("test"))
-        for own, (name, count) in zip(one.spawn(len(spp)), spp.items(), strict=True):
-            sample[name] = np.ascontiguousarray(render.radiance(camera, count, int(own.generate_state(1)[0])))
+    for camera, view_seed in zip(cameras, seeds, strict=True):
+        sample = render.view(camera, view_seed, render.spec.fields("test"))
+        for spp_seed, (name, count) in zip(view_seed.spawn(len(spp)), spp.items(), strict=True):
+            sample[name] = np.ascontiguousarray(render.radiance(camera, count, int(spp_seed.generate_state(1)[0])))
         yield sample
 
 
 def _points(perturber: ViewPerturber, points: Points, view_set: ViewSet) -> Points:
-    """The point cloud of a set: training's, as the changed scene has it, or another draw."""
+    """Return the point cloud of a set: training's in the changed scene, or another draw."""
     if view_set.ladder != DRAWS:
         return (
             perturber.scene.moved_points(points)
@@ -193,9 +195,9 @@ def _points(perturber: ViewPerturber, points: Points, view_set: ViewSet) -> Poin
 def read_views(
     directory: AnyPath, spec: DatasetSpec, suites: Suites, view_set: ViewSet, points: Points | None = None
 ) -> dict[str, Tensor]:
-    """The views of a set as a batch, with "traced_N" and, of the clean ones, "input_N"; with other points, if given.
+    """Read the views of a set as a batch, with "traced_N" and, in the clean set, "input_N".
 
-    Of a draw, only what differs from the clean views.
+    `points` replaces the set's points. A draw has only the fields that differ from the clean views.
     """
     names = list(_DRAWN)
     if view_set.ladder != DRAWS:

@@ -1,8 +1,8 @@
-"""`nlt stress`: trained methods on suites of growing severity, without retraining; where each breaks.
+"""`nlt stress`: evaluates trained methods on suites of growing severity, to find where each breaks.
 
-results/NAME/stress/ holds `stress.csv`, a row per method, suite, ladder, severity and view; `manifest.json`, with the
-manifest of the suites in it; and, outside git, `images/SUITE-METHOD.npz`, the radiance of a suite's highest
-severities. Everything else there is made from these: nlt/stress/tables.py.
+results/NAME/stress/ holds `stress.csv`, with a row per method, suite, ladder, severity and view; `manifest.json`, which
+includes the manifest of the suites; and, outside git, `images/SUITE-METHOD.npz`, with the radiance at a suite's highest
+severities. nlt/stress/tables.py makes everything else there from these.
 """
 
 from __future__ import annotations
@@ -46,19 +46,30 @@ def stress(
     manifest: str = "suites",
     views: int | None = None,
 ) -> Path:
-    """Train what `nlt compare` would have, render the suites, judge; what is there already is kept.
+    """Train the methods as `nlt compare` does, render the suites and evaluate; existing results are kept.
 
-    `views` of each scene: the manifest's unless given.
+    Args:
+        config: a config in configs/compare, by name or path.
+        out: the results' directory; None for results/ and the config's name.
+        scale: a config in configs/scale in place of the comparison's.
+        data: a config in configs/data in place of the comparison's.
+        methods: the methods, in place of the comparison's.
+        suites: names out of `SUITES`; None for all.
+        manifest: the manifest of the suites in configs/stress, by name or path.
+        views: the number of views of each scene, in place of the manifest's.
+
+    Returns:
+        The directory of the stress results.
 
     Raises:
-        UserError: a config is wrong, or an output is not finite; then, too, everything is written.
+        UserError: a config is wrong, or an output is not finite; even then, everything is written.
     """
     start, begun = time.time(), origin()
     comparison, content = Comparison.load(config, scale, data, methods), load_suites(manifest, views)
     wanted = list(suites or SUITES)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])
     if not spec.test:
-        raise UserError(f"{comparison.scale}: data.dataset.test: is 0; the suites change test samples")
+        raise UserError(f"{comparison.scale}: data.dataset.test: must be at least 1: the suites change test samples")
     check(comparison)
     _check_changes(content)
     dataset = generate(spec, root)
@@ -66,7 +77,7 @@ def stress(
     trainings = {
         name: Training.of(comparison, name, seed, runs) for name in comparison.methods if not build_if_untrained(name)
     }
-    died = train(list(trainings.values()), "local", None, {})
+    failures = train(list(trainings.values()), "local", None, {})
     rendered = render_suites(spec, dataset, content, wanted, root)
     device = default_device()
     policy = Policy.for_device(device, comparison.precision)
@@ -78,41 +89,41 @@ def stress(
         "manifest": dict(content.content), "left_out": _left_out(spec, content),
     }  # fmt: skip
     print("".join(f"left out: {reason}\n" for reason in record["left_out"]), end="", flush=True)
-    rows = [row for row in _old(directory / ROWS) if row["suites"] == rendered.name]
+    rows = [row for row in _stored_rows(directory / ROWS) if row["suites"] == rendered.name]
     before = _measured(directory)
-    shown = set[str]()  # suites whose references are written
+    shown = set[str]()  # suites whose references have been written
     judged = [CLEAN, *(suite for suite in SUITES if suite in wanted and suite != TRAINING)]
     bar = tqdm(total=len(comparison.methods) * len(judged), unit="suite", file=sys.stderr, mininterval=1.0)
     for name in comparison.methods:
         bar.set_description(f"judging {name}")
-        method, took = build_if_untrained(name), dict[str, Any]()
+        method, outcome = build_if_untrained(name), dict[str, Any]()
         try:
-            if method is None and trainings[name] in died:
-                raise DivergedError(died[trainings[name]])
+            if method is None and trainings[name] in failures:
+                raise DivergedError(failures[trainings[name]])
             if method is None:
-                method, took = trainings[name].load(device)
+                method, outcome = trainings[name].load(device)
         except DivergedError as problem:
             record["left_out"].append(f"{name}: {problem}")
             bar.write(f"left out: {record['left_out'][-1]}")
             bar.update(len(judged))
             continue
-        label = {"method": name, "suites": rendered.name, "run": Path(took.get("run", name)).name}
+        label = {"method": name, "suites": rendered.name, "run": Path(outcome.get("run", name)).name}
         rows = [row for row in rows if row["method"] != name or row["run"] == label["run"]]
         for suite in judged:
-            own = sum((row["method"], row["suite"]) == (name, suite) for row in rows)
+            count = sum((row["method"], row["suite"]) == (name, suite) for row in rows)
             images = directory / IMAGES / f"{suite}-{name}.npz"
             mark = f"{rendered.name} {label['run']} {content.content.get(suite)}"
-            if not _is_there(images, mark, own):
-                found, radiance = suite_views.judge(method, suite)
+            if not _is_complete(images, mark, count):
+                judged_views, radiance = suite_views.judge(method, suite)
                 rows = [row for row in rows if (row["method"], row["suite"]) != (name, suite)]
-                rows += [{**label, "suite": suite, **row} for row in found]
+                rows += [{**label, "suite": suite, **row} for row in judged_views]
                 write_rows(directory / ROWS, rows)
                 write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
                 if suite not in (FLICKER, *shown):
                     write_images(directory, f"{suite}-reference", **suite_views.references(suite))
                     shown.add(suite)
-                # The last: all is there.
-                write_images(directory, images.stem, **radiance, mark=np.array(mark), rows=np.array(len(found)))
+                # Written last: it marks the suite as complete.
+                write_images(directory, images.stem, **radiance, mark=np.array(mark), rows=np.array(len(judged_views)))
             bar.update()
     bar.close()
     write_rows(directory / ROWS, rows)
@@ -120,15 +131,15 @@ def stress(
         clean = suite_views.batches(CLEAN)["views", 0]
         error = lambda method: float(np.mean([row["error"] for row in suite_views.rows(method, clean)[0]]))
         train_suite(directory, comparison, content.content[TRAINING], runs, error, device)
-    if _measured(directory) != before:  # else the manifest is of the run that measured it
+    if _measured(directory) != before:  # otherwise keep the manifest of the run that measured them
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
     section = stress_section(directory.parent)
-    if (directory.parent / RUNS).exists():  # the results of `nlt compare`, whose report shows the section, too
+    if (directory.parent / RUNS).exists():  # the results of `nlt compare`, whose report shows this section too
         results = load(directory.parent)
         write_page(results, write_claims(results), sections=[section])
     print(f"written to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
     if broken := sum(row["nonfinite"] for row in rows):
-        raise UserError(f"{directory / ROWS}: nonfinite: {broken:.0f} pixels are not finite; see the rows above zero")
+        raise UserError(f"{directory / ROWS}: nonfinite: {broken:.0f} pixels are not finite; see the rows above 0")
     return directory
 
 
@@ -140,8 +151,8 @@ def _check_changes(suites: Suites) -> None:
             raise UserError(f"{place}: must be one of {', '.join(known)}, is {ladder.change!r}")
 
 
-def _is_there(images: Path, mark: str, rows: int) -> bool:
-    """Whether a suite was judged to its end: of the same views and method, and no row was lost since."""
+def _is_complete(images: Path, mark: str, rows: int) -> bool:
+    """Return whether a suite was fully judged, on the same views and method, and no row was lost since."""
     if not images.exists():
         return False
     with np.load(images) as file:
@@ -152,8 +163,7 @@ def _measured(directory: Path) -> list[bytes]:
     return [path.read_bytes() for name in (ROWS, TRAININGS) if (path := directory / name).exists()]
 
 
-def _old(path: Path) -> list[dict[str, Any]]:
-    """What an earlier run has judged."""
+def _stored_rows(path: Path) -> list[dict[str, Any]]:
     return read_rows(path) if path.exists() else []
 
 

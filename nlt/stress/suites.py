@@ -1,4 +1,4 @@
-"""The stress suites that a manifest of configs/stress names: ladders of changes, each at severities 1 to 5."""
+"""The stress suites of a manifest in configs/stress: ladders of changes, each at severities 1 to 5."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nlt.paths import find_config
 CLEAN, FLICKER, TRAINING = "clean", "flicker", "training"
 RENDERED = ("light", "geometry", "materials", "camera")  # suites whose views are rendered
 COMPUTED = ("budget", "frame")  # suites that change a rendered view's inputs
-PATHS = ("camera", "light", "object")  # of flicker: what moves
+PATHS = ("camera", "light", "object")  # of the suite flicker, by the thing that moves
 SUITES = (*RENDERED, *COMPUTED, FLICKER, TRAINING)
 _KEYS = {
     "": ("version", "seed", "views", "reference", "traced", *SUITES),
@@ -29,7 +29,7 @@ _LADDER = ("change", "values", "says")
 
 @dataclass(frozen=True)
 class Ladder:
-    """One change at growing severity: `values[k]` is that of severity k + 1."""
+    """One change at growing severity; `values[k]` belongs to severity k + 1."""
 
     suite: str
     name: str
@@ -40,7 +40,7 @@ class Ladder:
 
 @dataclass(frozen=True)
 class Suites:
-    """A manifest. `ladders` are those of the rendered and computed suites."""
+    """A manifest; `ladders` are those of the rendered and computed suites."""
 
     file: Path
     content: Mapping[str, Any]
@@ -51,17 +51,17 @@ class Suites:
         return int(self.content["views"])
 
     def directory(self, spec: DatasetSpec, root: str | AnyPath) -> AnyPath:
-        """Where the rendered suites of a dataset lie: named by the dataset and a hash of the manifest."""
-        decides = {key: value for key, value in self.content.items() if key not in (*COMPUTED, TRAINING)}
-        digest = hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
+        """Return the directory of a dataset's rendered suites, named by the dataset and a hash of the manifest."""
+        relevant = {key: value for key, value in self.content.items() if key not in (*COMPUTED, TRAINING)}
+        digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:8]
         return open_path(root) / f"{spec.directory(root).name}-stress-{digest}"
 
 
 def load_suites(config: str, views: int | None = None) -> Suites:
-    """Read a manifest by name or path; `views` of each scene override its own.
+    """Read a manifest by name or path; `views` overrides its number of views per scene.
 
     Raises:
-        UserError: a key is unknown or missing, or a value is not what it should be.
+        UserError: a key is unknown or missing, or a value is wrong.
     """
     file = find_config("stress", config)
     content = read_configs([str(file)]) | ({} if views is None else {"views": views})

@@ -1,4 +1,4 @@
-"""What the stress suites say, made from their rows alone: tables and sentences."""
+"""The tables and sentences of the stress suites, made from their rows alone."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from nlt.report.tables import Table, as_markdown
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
-DOUBLED = 2.0  # times the clean error: broken
+DOUBLED = 2.0  # growth over the clean error at which a method breaks
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
 _NONE = "–"
 
 
 @dataclass(frozen=True)
 class Stressed:
-    """Rows of stress.csv and training.csv with the manifest beside them."""
+    """The rows of stress.csv and training.csv, and their manifest."""
 
     directory: Path
     manifest: dict[str, Any]
@@ -39,60 +39,59 @@ class Stressed:
 
     @cached_property
     def ladders(self) -> list[tuple[str, str]]:
-        """Suite and name of every ladder that was climbed, in the manifest's order."""
-        there = {(row["suite"], row["ladder"]) for row in self.rows}
+        """Suite and name of every ladder that has rows, in the manifest's order."""
+        present = {(row["suite"], row["ladder"]) for row in self.rows}
         known = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
-        return [key for key in known if key in there]
+        return [key for key in known if key in present]
 
     def says(self, ladder: tuple[str, str]) -> str:
         return str(self.manifest["manifest"][ladder[0]][ladder[1]]["says"])
 
     @cached_property
     def _means(self) -> dict[tuple, float]:
-        """Of the views' errors."""
-        found: dict[tuple, list[float]] = {}
+        """Mean error over views, by method, suite, ladder and severity."""
+        errors: dict[tuple, list[float]] = {}
         for row in self.rows:
             if row["suite"] != FLICKER:
                 key = (row["method"], row["suite"], row["ladder"], row["severity"])
-                found.setdefault(key, []).append(row["error"])
-        return {key: float(np.mean(errors)) for key, errors in found.items()}
+                errors.setdefault(key, []).append(row["error"])
+        return {key: float(np.mean(values)) for key, values in errors.items()}
 
     def clean(self, method: str) -> float:
-        """The error of the views as they are."""
+        """Return the error on the clean views."""
         return self._means.get((method, CLEAN, "views", 0), math.nan)
 
     def errors(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
-        """(S + 1,) errors by severity, that of the clean views first; empty where a method is not concerned.
+        """Return the errors (S + 1,) by severity, the clean one first; empty where a method is not affected.
 
-        An estimate below zero, which one without bias may be, counts as zero.
+        A negative estimate, which an unbiased one may be, counts as zero.
         """
         keys = [(method, *ladder, severity) for severity in range(1, 6)]
-        found = [max(self._means[key], 0.0) for key in keys if key in self._means]
-        return np.array([self.clean(method), *found]) if found else np.zeros(0)
+        means = [max(self._means[key], 0.0) for key in keys if key in self._means]
+        return np.array([self.clean(method), *means]) if means else np.zeros(0)
 
     def error(self, method: str, ladder: tuple[str, str], severity: int) -> float:
-        """The error at a severity; the clean error of a method that a ladder does not concern."""
+        """Return the error at a severity; the clean error where the ladder does not affect the method."""
         errors = self.errors(method, ladder)
         return float(errors[severity]) if len(errors) else self.clean(method)
 
     def growth(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
-        """(S + 1,) `errors` over the clean error."""
+        """Return `errors` (S + 1,) over the clean error."""
         errors = self.errors(method, ladder)
         return errors / errors[0] if len(errors) else errors
 
     def nonfinite(self, method: str) -> int:
-        """Pixels that are not finite, over all suites."""
+        """Return the number of pixels that are not finite, over all suites."""
         return int(sum(row["nonfinite"] for row in self.rows if row["method"] == method))
 
     def flicker(self, method: str, kind: str) -> float:
-        """Mean over scenes of a kind's value; NaN where the method is not concerned."""
+        """Return the mean over scenes of a kind's value; NaN where the method is not affected."""
         values = [r["value"] for r in self.rows if (r["method"], r["suite"], r["ladder"]) == (method, FLICKER, kind)]
         return float(np.mean(values)) if values else math.nan
 
 
 def breaking_point(growth: np.ndarray) -> float:
-    """The severity at which the error has doubled, by linear interpolation between severities; infinite if it never
-    does."""
+    """Return the severity at which the error has doubled, by linear interpolation; infinite if it never does."""
     for severity in range(1, len(growth)):
         if growth[severity] >= DOUBLED:
             before, after = growth[severity - 1], growth[severity]
@@ -101,7 +100,7 @@ def breaking_point(growth: np.ndarray) -> float:
 
 
 def load_stress(directory: Path) -> Stressed | None:
-    """What is in a directory; None where nothing is."""
+    """Read the stress results in a directory; None where there are none."""
     if not (directory / ROWS).exists() or not (directory / MANIFEST).exists():
         return None
     trainings = directory / TRAININGS
@@ -114,13 +113,13 @@ def load_stress(directory: Path) -> Stressed | None:
 
 
 def write_stress(stressed: Stressed) -> None:
-    """breaking.csv and stress.md."""
+    """Write breaking.csv and stress.md."""
     write_rows(stressed.directory / BREAKING, _rows(stressed))
     write_bytes(stressed.directory / TEXT, _text(stressed).encode())
 
 
 def _rows(stressed: Stressed) -> list[dict[str, Any]]:
-    """A row per method and ladder: errors and their growth by severity, the breaking point, ranks."""
+    """Return a row per method and ladder: errors, their growth and ranks by severity, and the breaking point."""
     rows = []
     for ladder in stressed.ladders:
         errors = {m: e for m in stressed.methods if len(e := stressed.errors(m, ladder))}
@@ -137,7 +136,7 @@ def _rows(stressed: Stressed) -> list[dict[str, Any]]:
 
 
 def _ranks(errors: list[np.ndarray]) -> np.ndarray:
-    """(methods, severities) 1 for the lowest error."""
+    """Return the ranks (methods, severities), 1 for the lowest error."""
     return scipy.stats.rankdata(np.stack(errors), axis=0, method="min")
 
 
@@ -154,7 +153,7 @@ def _text(stressed: Stressed) -> str:
 
 
 def introduction(stressed: Stressed) -> str:
-    """What was measured, of what, and what was left out."""
+    """Return a paragraph on the measurement and the parts left out."""
     manifest = stressed.manifest
     return (
         f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: at each severity "
@@ -167,25 +166,25 @@ def introduction(stressed: Stressed) -> str:
 
 
 def paragraphs(stressed: Stressed) -> list[str]:
-    """Markdown, one for each method."""
+    """Return a Markdown paragraph for each method."""
     return [_about(stressed, method) for method in stressed.methods]
 
 
 def tables(stressed: Stressed) -> list[Table]:
-    """Breaking points, ranks, flicker, trainings: those of them that there are."""
-    found = [_breaking(stressed), _ranking(stressed), _flicker(stressed), _training(stressed)]
-    return [table for table in found if table.rows]
+    """Return the tables of breaking points, ranks, flicker and trainings, without empty ones."""
+    all_tables = [_breaking(stressed), _ranking(stressed), _flicker(stressed), _training(stressed)]
+    return [table for table in all_tables if table.rows]
 
 
 def _about(stressed: Stressed, method: str) -> str:
-    """A paragraph: where a method breaks, by how much, what is better there, what it withstands."""
+    """Return a paragraph: where a method breaks, by how much, which is better there, and the changes it withstands."""
     points = {ladder: breaking_point(g) for ladder in stressed.ladders if len(g := stressed.growth(method, ladder))}
     broken = sorted((at, ladder) for ladder, at in points.items() if math.isfinite(at))
     held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
     parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
     for at, ladder in broken[:5]:
         growth = stressed.growth(method, ladder)
-        worst = int(growth.argmax())  # not always the highest: a camera at a wall sees less than one before it
+        worst = int(growth.argmax())  # not always the highest severity: a camera very close to a wall sees little
         own = stressed.error(method, ladder, worst)
         rivals = {m: stressed.error(m, ladder, worst) for m in stressed.methods if m != method}
         best = min(rivals, key=rivals.__getitem__, default=None)
@@ -222,12 +221,12 @@ def _breaking(stressed: Stressed) -> Table:
 
 
 def severity(at: float, highest: int) -> str:
-    """A breaking point as it is printed."""
+    """Return a breaking point as text."""
     return f"{at:.1f}" if math.isfinite(at) else f"> {highest}"
 
 
 def _ranking(stressed: Stressed) -> Table:
-    """How the order of the methods at the highest severity compares to that of the clean views."""
+    """Compare the order of the methods at the highest severity with that on the clean views."""
     rows = []
     for ladder in stressed.ladders:
         errors = {m: e for m in stressed.methods if len(e := stressed.errors(m, ladder))}

@@ -1,4 +1,4 @@
-"""The stress suite "training": short trainings with other seeds, learning rates, precision and damaged samples."""
+"""The stress suite "training": short trainings with other seeds, learning rates, precision or corrupted samples."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ SEED, RATE, PRECISION, CORRUPTED = "seed", "learning rate", "precision", "corrup
 
 
 class Corruption(L.Callback):
-    """Fireflies in the targets of a share of the samples, the same ones at every epoch."""
+    """Adds fireflies to the targets of a share of the samples, the same ones in every epoch."""
 
     def __init__(self, share: float, factor: float = 1e4, one_in: int = 100) -> None:
         self.every, self.factor, self.one_in = max(1, round(1 / share)), factor, one_in
 
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        """Multiply the radiance of one pixel in `one_in`."""
+        """Multiply the radiance of one in `one_in` pixels by `factor`."""
         for k in torch.nonzero(batch["index"] % self.every == 0).flatten().tolist():
             batch["noisy"][k].view(3, -1)[:, k % self.one_in :: self.one_in] *= self.factor
 
 
 @dataclass
 class _Varied(Comparison):
-    """A comparison with one more config over each method's own."""
+    """A comparison with one more config that overrides each method's own."""
 
     over: Path | None = None
 
@@ -56,14 +56,14 @@ def train_suite(
     error: Callable[[Method], float],
     device: torch.device,
 ) -> None:
-    """Train a method of each class in every variation, and write training.csv: a row each, with its relative `error`.
+    """Train one method of each kind in every variation and write training.csv, a row each, with its relative `error`.
 
     Raises:
         UserError: the scale has no trainer.max_steps.
     """
-    kept = {(row["method"], row["run"]): row["error"] for row in _old(directory / TRAININGS)}
+    kept = {(row["method"], row["run"]): row["error"] for row in _finished_rows(directory / TRAININGS)}
     jobs: list[tuple[dict[str, Any], Training]] = []
-    for method in _one_of_a_kind(comparison):
+    for method in _one_per_kind(comparison):
         config = read_configs(comparison.configs(method))
         for variation, value, seed, over in _variations(config, content, comparison):
             file = runs / STRESS / f"{method}-{variation}-{value}.yaml".replace(" ", "_").replace("/", "_")
@@ -71,11 +71,11 @@ def train_suite(
             own = {field.name: getattr(comparison, field.name) for field in fields(Comparison)}
             training = Training.of(_Varied(**own, over=file), method, seed, runs / STRESS)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
-    # Networks this small leave a second core idle; an accelerator is one's own.
-    died = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
+    # Networks this small leave a second core idle; an accelerator runs one training at a time.
+    failures = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
     rows = []
     for row, training in jobs:
-        row |= {"status": FAILED if training in died else OK, "message": died.get(training, "")}
+        row |= {"status": FAILED if training in failures else OK, "message": failures.get(training, "")}
         row["run"] = training.run.name
         known = kept.get((training.method, training.run.name))
         try:
@@ -87,30 +87,30 @@ def train_suite(
     write_rows(directory / TRAININGS, rows)
 
 
-def _old(path: Path) -> list[dict[str, Any]]:
+def _finished_rows(path: Path) -> list[dict[str, Any]]:
     return [row for row in read_rows(path) if row["status"] == OK] if path.exists() else []
 
 
-def _one_of_a_kind(comparison: Comparison) -> list[str]:
-    """The first trained method of each class and set of inputs."""
-    found: dict[str, str] = {}
+def _one_per_kind(comparison: Comparison) -> list[str]:
+    """Return the first trained method of each class and set of inputs."""
+    first_of_kind: dict[str, str] = {}
     for method in comparison.methods:
         if not build_if_untrained(method):
             model = read_configs([comparison.configs(method)[1]])["model"]
             kind = {
                 k: v for k, v in model.get("init_args", {}).items() if not isinstance(v, int) or isinstance(v, bool)
             }
-            found.setdefault(f"{model['class_path']} {kind}", method)
-    return list(found.values())
+            first_of_kind.setdefault(f"{model['class_path']} {kind}", method)
+    return list(first_of_kind.values())
 
 
 def _variations(
     config: Mapping[str, Any], content: Mapping[str, Any], comparison: Comparison
 ) -> list[tuple[str, str, int, dict[str, Any]]]:
-    """What varies, how it is called, the seed, and the config over the method's own."""
+    """Return each variation's kind, value, seed, and the config that overrides the method's own."""
     steps = config.get("trainer", {}).get("max_steps")
     if not steps:
-        raise UserError(f"{comparison.scale}: trainer.max_steps: missing; the suite training takes a share of it")
+        raise UserError(f"{comparison.scale}: trainer.max_steps: missing; the suite training needs it")
     default = inspect.signature(RenderingModule).parameters["learning_rate"].default
     rate = config["model"].get("init_args", {}).get("learning_rate", default)
     steps = max(1, round(content["share"] * steps))

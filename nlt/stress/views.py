@@ -1,4 +1,4 @@
-"""The views of the stress suites as batches, and what a method makes of them."""
+"""The views of the stress suites as batches, and the evaluation of methods on them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
 
 
 class SuiteViews:
-    """The rendered suites as batches, and what a method makes of them."""
+    """The rendered suites as batches, and the evaluation of methods on them."""
 
     def __init__(
         self,
@@ -44,19 +44,19 @@ class SuiteViews:
         self.batches = cache(self._batches)
 
     def _batches(self, suite: str) -> dict[tuple[str, int], list[Batch]]:
-        """Of each ladder and severity of a rendered suite: a batch per scene."""
-        found: dict[tuple[str, int], list[Batch]] = {}
+        """Return a batch per scene for each ladder and severity of a rendered suite."""
+        batches: dict[tuple[str, int], list[Batch]] = {}
         for view_set in self.view_sets:
             if view_set.suite == suite:
-                found.setdefault((view_set.ladder, view_set.severity), []).append(self._batch(view_set))
-        return found
+                batches.setdefault((view_set.ladder, view_set.severity), []).append(self._batch(view_set))
+        return batches
 
     def _batch(self, view_set: ViewSet) -> Batch:
         batch = read_views(self.directory, self.spec, self.suites, view_set)
         return {name: value.to(self.device) for name, value in batch.items()}
 
     def references(self, suite: str) -> dict[str, np.ndarray]:
-        """By ladder, of the highest severity: (V, 3, H, W) radiance; and the exposure (V,)."""
+        """Return the radiance (V, 3, H, W) at the highest severity, by ladder, and the exposure (V,)."""
         images = {}
         for ladder, _, batches in self._changed(suite, None):
             images[ladder] = torch.cat([(b["reference_a"] + b["reference_b"]) / 2 for b in batches]).cpu().numpy()
@@ -65,13 +65,13 @@ class SuiteViews:
 
     @torch.inference_mode()
     def judge(self, method: Method, suite: str) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-        """Rows of every ladder and severity of a suite, and the radiance of each ladder's highest severity."""
+        """Return rows for every ladder and severity of a suite, and the radiance at each ladder's highest severity."""
         if suite == FLICKER:
             return self._flicker(method), {}
         rows, images = [], {}
         for ladder, severity, batches in self._changed(suite, method):
-            found, radiance = self.rows(method, batches)
-            rows += [{"ladder": ladder, "severity": severity, **row} for row in found]
+            view_rows, radiance = self.rows(method, batches)
+            rows += [{"ladder": ladder, "severity": severity, **row} for row in view_rows]
             images[ladder] = radiance
         return rows, images
 
@@ -96,16 +96,16 @@ class SuiteViews:
 
     @torch.inference_mode()
     def rows(self, method: Method, batches: list[Batch]) -> tuple[list[dict[str, Any]], np.ndarray]:
-        """A row per view, and the radiance."""
+        """Return a row per view, and the radiance (V, 3, H, W)."""
         rows, images = [], []
         for batch in batches:
             prediction = self.predict(method, batch)
             reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
             bad = ~prediction.isfinite()
             finite = prediction.masked_fill(bad, 0)
-            each = ImageMetrics(perceptual=False).to(self.device).update(finite, *reference)
+            metrics = ImageMetrics(perceptual=False).to(self.device).update(finite, *reference)
             columns = {"error": relative_error(finite, *reference), "nonfinite": bad.any(1).sum((1, 2))}
-            columns |= {name: each[name] for name in ("unbiased_mse", "mse", "mssim")}
+            columns |= {name: metrics[name] for name in ("unbiased_mse", "mse", "mssim")}
             values = {name: column.tolist() for name, column in columns.items()}
             rows += [
                 {"scene": int(batch["scene"][k]), "view": k, **{name: column[k] for name, column in values.items()}}
@@ -115,12 +115,12 @@ class SuiteViews:
         return rows, np.concatenate(images)
 
     def predict(self, method: Method, batch: Batch) -> Tensor:
-        """The radiance of a batch, as `nlt compare` computes it."""
+        """Return the radiance of a batch, computed as `nlt compare` does."""
         if "traced" in method.fields:
             name = f"traced_{method.spp}"
             if name not in batch:
                 place = f"{self.suites.file}: traced"
-                raise UserError(f"{place}: lacks {method.spp}, the samples per pixel of {type(method).__name__}")
+                raise UserError(f"{place}: must contain {method.spp}, the samples per pixel of {type(method).__name__}")
             batch = batch | {"traced": batch[name]}
         with self.policy.applied(self.device):
             return method.to(self.device).eval()(batch)
@@ -128,18 +128,21 @@ class SuiteViews:
     # --- flicker ---
 
     def _flicker(self, method: Method) -> list[dict[str, Any]]:
-        """`value` of a draw's kind: the standard deviation of a pixel over the draws, relative to the image; of a
-        path: the frame-to-frame change relative to the reference's own."""
+        """Return a method's rows of the suite flicker.
+
+        The `value` of draws is the standard deviation of a pixel over the draws, relative to the image. The `value` of
+        a path is the mean square change from frame to frame, relative to the reference's.
+        """
         rows = []
         for scene, clean in enumerate(self.batches(CLEAN)["views", 0]):
             a, b = (expose(clean[f"reference_{half}"].double(), clean["exposure"]) for half in "ab")
             scale = (a * b).mean().item()
             for kind in ("points", "photons", "noise"):
                 if _reads(method, {"noise": "spp"}.get(kind, kind)):
-                    drawn = [expose(p, clean["exposure"]) for p in self._draws(method, scene, clean, kind)]
-                    variance = torch.stack(drawn).var(0).mean().item()
+                    images = [expose(p, clean["exposure"]) for p in self._draws(method, scene, clean, kind)]
+                    variance = torch.stack(images).var(0).mean().item()
                     rows.append({"ladder": kind, "severity": 0, "scene": scene, "value": (variance / scale) ** 0.5,
-                                 "nonfinite": sum(int((~d.isfinite()).sum()) for d in drawn)})  # fmt: skip
+                                 "nonfinite": sum(int((~d.isfinite()).sum()) for d in images)})  # fmt: skip
             for kind in PATHS:
                 if (kind, 0) not in self.batches(FLICKER) or len(self.batches(FLICKER)[kind, 0]) <= scene:
                     continue
@@ -165,7 +168,7 @@ class SuiteViews:
             yield self.predict(method, clean | {name: v for name, v in drawn.items() if name.startswith(prefix)})
 
     def _with_points(self, method: Method, view_set: ViewSet, clean: Batch) -> Tensor:
-        """With another draw of the points; each has what is learned of training's nearest point of its object."""
+        """Predict with another draw of points, each with the embedding of training's nearest point of its object."""
         drawn = read_points(self.directory / view_set.points_name)
         base = next(r for r in self.view_sets if r.suite == CLEAN and r.scene == view_set.scene)
         points = read_points(self.directory / base.points_name)
@@ -199,17 +202,17 @@ def _embeddings_of(method: Method, scene: int, points: Points, drawn: Points) ->
 
 
 def relative_error(prediction: Tensor, a: Tensor, b: Tensor, exposure: Tensor) -> Tensor:
-    """(B,) mean of (f - A)(f - B) / (((A + B) / 2)² + 0.01), in radiance times exposure.
+    """Return the mean (B,) of (f - A)(f - B) / (((A + B) / 2)² + 0.01), in radiance times exposure.
 
-    The numerator is that of the unbiased MSE. Each pixel counts by how wrong it is for its brightness: else a lamp in
-    view, or one view brighter than the others, would be all that counts, and a brighter light would be an error.
+    The numerator is that of the unbiased MSE. Each pixel's error is relative to its brightness; otherwise a lamp in
+    view or one bright view would dominate, and a brighter light alone would raise the error.
     """
     f, a, b = (expose(x.double(), exposure) for x in (prediction, a, b))
     return ((f - a) * (f - b) / (((a + b) / 2).square() + 0.01)).mean((1, 2, 3))
 
 
 def _reads(method: Method, change: str) -> bool:
-    """Whether a change of the inputs can reach a method."""
+    """Return whether a change of the inputs can affect a method."""
     if change == "pixels":
         return "one_in" in getattr(method, "hparams", ())
     inputs = {"points": "point_visible", "photons": "photon_flux", "spp": "noisy_input"}

@@ -15,15 +15,15 @@ function fill(select, options) {
   select.innerHTML = options.map(([value, text]) => `<option value="${escapeText(value)}">${escapeText(text)}</option>`).join("");
 }
 
-// ---- tables that sort ----
+// ---- sortable tables ----
 
-const number = (text) => parseFloat(text.replace(/,/g, "")); // what a cell begins with; NaN for one that is empty
+const number = (text) => parseFloat(text.replace(/,/g, "")); // the number at the start of a cell; NaN if there is none
 
 function sortTable(table, column, descending) {
   const key = (row) => (column ? number(row.cells[column].textContent) : Number(row.dataset.index));
   const rows = [...table.tBodies[0].rows].map((row) => [key(row), row]);
   const sign = descending ? -1 : 1;
-  rows.sort(([x], [y]) => isNaN(x) - isNaN(y) || sign * (x - y) || 0); // what has no number comes last
+  rows.sort(([x], [y]) => isNaN(x) - isNaN(y) || sign * (x - y) || 0); // cells without a number come last
   table.tBodies[0].append(...rows.map(([, row]) => row));
   for (const heading of table.tHead.rows[0].cells) heading.removeAttribute("aria-sort");
   table.tHead.rows[0].cells[column].setAttribute("aria-sort", descending ? "descending" : "ascending");
@@ -31,13 +31,13 @@ function sortTable(table, column, descending) {
 
 for (const heading of document.querySelectorAll("th[data-direction]")) {
   heading.firstElementChild.addEventListener("click", () => {
-    const sorted = heading.getAttribute("aria-sort"); // the best first, then the worst
+    const sorted = heading.getAttribute("aria-sort"); // the best first; at the next click, the worst
     const descending = sorted ? sorted === "ascending" : heading.dataset.direction === "higher";
     sortTable(heading.closest("table"), heading.cellIndex, descending);
   });
 }
 
-// ---- where a number comes from; by keyboard, as the ARIA authoring practices have it for grids ----
+// ---- provenance of numbers; keyboard navigation as in the ARIA authoring practices for grids ----
 
 const said = (element) => element.dataset.origin ?? "";
 
@@ -54,11 +54,11 @@ const tell = (event) => {
 };
 for (const type of ["mouseover", "mouseout", "focusin", "focusout"]) document.addEventListener(type, tell);
 
-const inGrid = (cell) => cell.querySelector("button") ?? cell; // a heading's focus is its button's
+const inGrid = (cell) => cell.querySelector("button") ?? cell; // in a heading, its button has the focus
 for (const table of document.querySelectorAll("table.grid")) {
   table.setAttribute("role", "grid");
   for (const row of table.rows) for (const cell of row.cells) inGrid(cell).tabIndex = -1;
-  inGrid(table.rows[0].cells[0]).tabIndex = 0; // Tab enters at one cell, the one it left last
+  inGrid(table.rows[0].cells[0]).tabIndex = 0; // Tab enters the grid at the cell that it left last
   table.addEventListener("focusin", (event) => {
     table.querySelector("[tabindex='0']").tabIndex = -1;
     event.target.tabIndex = 0;
@@ -72,20 +72,20 @@ for (const table of document.querySelectorAll("table.grid")) {
     event.preventDefault();
     const cell = table.rows[clamp(to[1], 0, down)].cells[clamp(to[0], 0, right)];
     inGrid(cell).focus();
-    cell.scrollIntoView({ block: "nearest", inline: "center" }); // from under the row's heading, which stays
+    cell.scrollIntoView({ block: "nearest", inline: "center" }); // not hidden behind the sticky row heading
   });
 }
 
 // ---- speed and accuracy ----
 
-let device = 0; // an index of data.devices
+let device = 0; // index into data.devices
 const valuesOf = (method) => ({ ...method.values, ...method.times[device] });
 
 const MARKERS = [
   "M-5,0a5,5 0 1,0 10,0a5,5 0 1,0 -10,0Z", "M-4.5,-4.5h9v9h-9Z", "M0,-6L6,0L0,6L-6,0Z", "M0,-6L5.5,4.5H-5.5Z",
   "M0,6L5.5,-4.5H-5.5Z", "M-2,-5.5h4v3.5h3.5v4h-3.5v3.5h-4v-3.5h-3.5v-4h3.5Z", "M-6,0L4.5,-5.5V5.5Z",
 ];
-const families = [...new Set(data.methods.map((method) => method.curve ?? method.id))]; // a curve, or a method alone
+const families = [...new Set(data.methods.map((method) => method.curve ?? method.id))]; // names of curves, and methods in no curve
 const styleOf = (method) => {
   const k = families.indexOf(method.curve ?? method.id);
   return { colour: `var(--c${k % 7})`, marker: MARKERS[k % MARKERS.length], dash: ["none", "6 3", "2 3"][k % 3] };
@@ -125,7 +125,7 @@ function axisTitle(key) {
   return key === "time_per_frame_s" ? `time per frame (${unit})` : heading;
 }
 
-// The points no other is better than in both, by cost.
+// The Pareto-optimal points, in order of cost.
 function paretoFront(points, direction) {
   const sign = direction === "lower" ? 1 : -1;
   const front = [];
@@ -157,7 +157,7 @@ function drawChart() {
   const [xKey, yKey] = [$("chart-x").value, $("chart-y").value];
   const place = $("chart");
   if (!xKey || !yKey) {
-    place.innerHTML = '<p class="note">Nothing was measured that could be drawn.</p>';
+    place.innerHTML = '<p class="note">There are no measurements to draw.</p>';
     return;
   }
   const [xQ, yQ] = [data.quantities[xKey], data.quantities[yKey]];
@@ -176,11 +176,11 @@ function drawChart() {
     return log ? [low / pad, high * pad] : [low - pad, high + pad];
   };
   if (!points.length) {
-    place.innerHTML = '<p class="note">No method has both.</p>';
+    place.innerHTML = '<p class="note">No method has both quantities.</p>';
     return;
   }
   const onOthers = data.methods.flatMap((method) => method.times.map((times) => times[xKey]?.[0] * xQ.scale));
-  const [x0, x1] = spread([...points.map((p) => p.x), ...onOthers.filter((x) => x > 0)], true); // one for all devices
+  const [x0, x1] = spread([...points.map((p) => p.x), ...onOthers.filter((x) => x > 0)], true); // one scale for all devices
   const yLog = yQ.unit === "1" && Math.min(...points.map((p) => p.low)) > 0
     && Math.max(...points.map((p) => p.high)) / Math.min(...points.map((p) => p.low)) > 20;
   const [y0, y1] = spread(points.flatMap((p) => [p.low, p.high]), yLog);
@@ -225,10 +225,10 @@ function drawChart() {
   place.innerHTML = `<svg viewBox="0 0 ${W} ${H}" role="group" aria-label="${escapeText(yQ.heading)} over ${escapeText(axisTitle(xKey))}">${parts.join("")}</svg>`
     + legend(points, narrow);
   const seeds = points.some((p) => p.high > p.low);
-  $("chart-note").textContent = (seeds ? "Bars: standard deviation over seeds, with one seed the 95% interval over test views. " : "")
-    + "Grey: Pareto front. Better is up for ↑, down for ↓. A click on a point shows its images."
+  $("chart-note").textContent = (seeds ? "Bars: standard deviation over seeds or, with one seed, the 95% interval over test views. " : "")
+    + "Grey: Pareto front. Higher is better for ↑, lower for ↓. Click on a point to show its images."
     + (absent.length ? ` Not shown: ${absent.map((m) => m.label + (m.status === "ok" ? " (not measured)" : ` (${m.status})`)).join(", ")}.` : "");
-  $("budget").innerHTML = front.map((p) => `<li>from ${plain(p.x)} ${escapeText(xQ.unit === "1" ? "" : xQ.unit)} on: <button type="button" data-method="${escapeText(p.method.id)}">${escapeText(p.method.label)}</button>, ${escapeText(yQ.heading)} ${escapeText(p.text)}</li>`).join("");
+  $("budget").innerHTML = front.map((p) => `<li>from ${plain(p.x)} ${escapeText(xQ.unit === "1" ? "" : xQ.unit)} up: <button type="button" data-method="${escapeText(p.method.id)}">${escapeText(p.method.label)}</button>, ${escapeText(yQ.heading)} ${escapeText(p.text)}</li>`).join("");
 }
 
 function legend(points, narrow) {
@@ -279,7 +279,7 @@ function drawStages() {
 
 // ---- packed images: the inverse of nlt/report/packing.py ----
 
-const half = new Float32Array(0x7c00); // of the half's bits, times 16
+const half = new Float32Array(0x7c00); // value of the half with these bits, times 16
 for (let bits = 0; bits < half.length; bits++) {
   const exponent = bits >> 10, mantissa = bits & 0x3ff;
   half[bits] = 16 * (exponent ? (1 + mantissa / 1024) * 2 ** (exponent - 15) : mantissa * 2 ** -24);
@@ -306,7 +306,7 @@ function unpack(bytes) {
   return images.map((_, k) => values.subarray(3 * k * size, 3 * (k + 1) * size));
 }
 
-const unpacked = new Map(); // view -> promise of its images, the last few used
+const unpacked = new Map(); // view -> promise of its images, for the last few views
 
 function imagesOf(view) {
   const found = unpacked.get(view) ?? (async () => {
@@ -320,7 +320,7 @@ function imagesOf(view) {
   return found;
 }
 
-// ---- display: that of nlt/metrics/display.py ----
+// ---- display transform, as in nlt/metrics/display.py ----
 
 function display(x) {
   const linear = clamp(x, 0, 1);
@@ -329,7 +329,7 @@ function display(x) {
 
 const colours = Uint8Array.from(atob(data.colours ?? ""), (c) => c.charCodeAt(0));
 
-// A canvas of an image as displayed, or of its error map; both in the image's own pixels.
+// Returns a canvas with an image as displayed, or its error map, at the image's resolution.
 function picture(images, index, ev, error) {
   const { width: W, height: H } = data;
   const size = W * H, canvas = document.createElement("canvas");
@@ -370,7 +370,7 @@ function set(change) {
   state.split = clamp(state.split, 0, 1);
   draw();
   clearTimeout(linkTimer);
-  linkTimer = setTimeout(() => history.replaceState(null, "", link()), 150); // browsers limit how often
+  linkTimer = setTimeout(() => history.replaceState(null, "", link()), 150); // browsers limit the rate
 }
 
 function link() {
@@ -380,7 +380,7 @@ function link() {
   return "#" + new URLSearchParams(Object.entries(all).map(([k, v]) => [k, round(v)]));
 }
 
-// The state that a link describes; what it does not say, or says of another report, stays as it begins.
+// Sets the state that a link describes; missing values, or values of another report, keep their defaults.
 function restore() {
   const given = new URLSearchParams(location.hash.slice(1));
   if (!data.views.length || !given.has("view")) return;
@@ -401,7 +401,7 @@ async function draw() {
   const { view, a, b, mode, front, split, zoom, x, y, ev, error } = state;
   drawControls();
   const images = await imagesOf(view);
-  if (view !== state.view) return; // another view was asked for meanwhile
+  if (view !== state.view) return; // another view was requested meanwhile
   const of = [view, ev, error].join();
   if (pictures.of !== of) pictures = { of, made: new Map() };
   const made = (id) => {
@@ -429,7 +429,7 @@ async function draw() {
     context.imageSmoothingEnabled = false;
     context.drawImage(made(button.dataset.id), ...source, 0, 0, own.width, own.height);
   }
-  canvas.dataset.drawn = JSON.stringify(state); // what the tests wait for
+  canvas.dataset.drawn = JSON.stringify(state); // the tests wait for this
 }
 
 const labelOf = (id) => data.images[imageIndex.get(id)].label;
@@ -479,13 +479,13 @@ function drawMetrics() {
   drawViews();
 }
 
-// A chart of every view's metric, of A and B; a click goes to the view.
+// Draws a metric of A and B for every view; a click goes to the view.
 function drawViews() {
   const { key } = state, W = Math.max(260, $("views").clientWidth), H = 130, [left, top, bottom] = [44, 8, H - 22];
   const value = (k, id) => data.views[k].metrics[id]?.[key]?.[0];
   const all = data.views.flatMap((_, k) => [value(k, state.a), value(k, state.b)]).filter((v) => v !== undefined);
   if (!all.length) {
-    $("views").innerHTML = '<p class="note">Neither A nor B has it.</p>';
+    $("views").innerHTML = '<p class="note">Neither A nor B has this metric.</p>';
     return;
   }
   const [low, high] = [Math.min(0, ...all), Math.max(...all) || 1];
@@ -499,11 +499,11 @@ function drawViews() {
       ${mark(state.a, (x, y) => `<circle cx="${x}" cy="${y}" r="3.5" fill="var(--a)"/>`)}
       ${mark(state.b, (x, y) => `<rect x="${x - 3.2}" y="${y - 3.2}" width="6.4" height="6.4" fill="none" stroke="var(--b)" stroke-width="1.8"/>`)}</g>`);
   });
-  parts.push(`<text class="axis" x="${left + (W - left) / 2}" y="${H - 4}" text-anchor="middle">view (● A, □ B); a click goes there</text>`);
+  parts.push(`<text class="axis" x="${left + (W - left) / 2}" y="${H - 4}" text-anchor="middle">view (● A, □ B); click to go there</text>`);
   $("views").innerHTML = `<svg viewBox="0 0 ${W} ${H}" aria-hidden="true">${parts.join("")}</svg>`;
 }
 
-function zoomTo(zoom, u = 0.5, v = 0.5) { // the image's point at (u, v) of the stage stays there
+function zoomTo(zoom, u = 0.5, v = 0.5) { // keeps the image's point at (u, v) of the stage in place
   const next = clamp(zoom, 1, 64), shift = 1 / state.zoom - 1 / next;
   set({ zoom: next, x: state.x + (u - 0.5) * shift, y: state.y + (v - 0.5) * shift });
 }
@@ -618,7 +618,7 @@ function startViewer() {
   on("stage", "pointerdown", startDrag);
   on("stage", "pointermove", onPoint);
   on("stage", "wheel", (event) => {
-    if (!event.ctrlKey && !$("stage").contains(document.activeElement)) return; // else the page scrolls
+    if (!event.ctrlKey && !$("stage").contains(document.activeElement)) return; // the page scrolls instead
     event.preventDefault();
     const box = $("stage").getBoundingClientRect();
     zoomTo(state.zoom * 2 ** (-Math.sign(event.deltaY) / 2), (event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
@@ -647,7 +647,7 @@ restore();
 addEventListener("hashchange", restore);
 let width = innerWidth;
 addEventListener("resize", () => {
-  if (innerWidth === width) return; // a phone's address bar comes and goes
+  if (innerWidth === width) return; // a phone's address bar changes only the height
   width = innerWidth;
   drawChart();
   if (data.views.length) draw();
