@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint install clean
+.PHONY: demo test quick lint install clean
 
 demo: $(VENV)/.installed
 	$(BIN)/nlt compare --config demo
@@ -12,6 +12,10 @@ demo: $(VENV)/.installed
 # Files side by side, a thread each: threads of several processes on the same cores wait for one another, spinning.
 test: $(VENV)/.test-installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# Without the tests that train, render much or open a browser: minutes instead of a quarter of an hour.
+quick: $(VENV)/.test-installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow and not browser"
 
 lint: $(VENV)/.test-installed
 	$(BIN)/ruff check .

@@ -204,3 +204,10 @@ def first_hit(triangles, origins, directions):
         results.append((t[k], k, (1 - u[k] - v[k], u[k], v[k])))
     t, which, weights = zip(*results, strict=True)
     return np.array(t), np.array(which), np.array(weights)
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that open a page in chromium."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.browser)

@@ -33,7 +33,7 @@ def test_files_and_tests_exist(page):
         if not (page.parent / link).exists() or (anchor and anchor not in anchors(page.parent / link)):
             missing.append(f"{link}#{anchor}")
     for file, name in re.findall(r"(test_\w+\.py)::(\w+)", text):
-        if f"def {name}(" not in (PROJECT / "tests" / file).read_text():
+        if f"def {name}(" not in next((PROJECT / "tests").rglob(file)).read_text():
             missing.append(f"{file}::{name}")
     assert not missing
 

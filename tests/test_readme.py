@@ -30,12 +30,12 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import rooms
 from nlt.scenes.description import load_description
 from nlt.scenes.state import sample_view
-from nlt.select.space import Ladder
+from nlt.select.space import SearchSpace
 from nlt.stress.suites import load_suites
 from nlt.training import check_configs
 
 pytest_plugins = ["training_fixtures"]
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 README, CONTRIBUTING = PROJECT / "README.md", PROJECT / "CONTRIBUTING.md"
 PAGES = [README, CONTRIBUTING, *sorted((PROJECT / "docs").glob("*.md"))]
@@ -107,7 +107,7 @@ def test_every_command_is_covered():
     assert set(found) == set(covered), "a command belongs into RUN, or into ELSEWHERE beside the test that runs it"
     for command, test in ELSEWHERE.items():
         file, name = test.split("::")
-        assert f"def {name}(" in (PROJECT / "tests" / file).read_text(), command
+        assert f"def {name}(" in next((PROJECT / "tests").rglob(file)).read_text(), command
 
 
 @cache
@@ -134,7 +134,7 @@ def parse(command):
             _taken(tuple(comparison.configs(method)))
         assert name == "compare" or load_suites(options.manifest)
     elif name == "select":
-        assert Ladder.load(options.config, options.minutes).methods
+        assert SearchSpace.load(options.config, options.minutes).methods
     elif name == "bench":
         assert load_spec([str(find_config("data", options.data)), str(find_config("scale", options.scale))])
     elif name in ("report", "dashboard"):

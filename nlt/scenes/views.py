@@ -19,7 +19,7 @@ _RAYS = 256  # around the camera, and the same number through the image
 _NEAR = 0.2  # metres
 _PROBES = 16  # camera positions that reveal which shapes are inside out
 _TRIES = 100
-# Thresholds that separate good from bad views in the six real rooms (tests/test_real_scenes.py repeats a part). Of 900
+# Thresholds that separate good from bad views in the six real rooms (test_real_scenes.py repeats a part). Of 900
 # views from the camera boxes, 98% pass: in 99%, back is below 0.2 and nothing below 0.42; in 95%, near is 0. Of 381
 # views from inside closed meshes, none passes: in 99%, back is above 0.46. Of 430 views from outside the rooms, 3%
 # pass, most of them from the recess of a window.

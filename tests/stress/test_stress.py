@@ -34,6 +34,8 @@ from nlt.stress.rendering import view_sets
 from nlt.stress.suites import load_suites
 from nlt.stress.tables import breaking_point
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = ["training_fixtures"]
 
 MANIFEST = CONFIGS / "stress" / "suites.yaml"

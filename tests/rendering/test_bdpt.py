@@ -21,6 +21,8 @@ from nlt.scenes.description import load_description
 from nlt.scenes.lanes import is_jit
 from nlt.scenes.state import rest_state, sample_view
 
+pytestmark = pytest.mark.slow
+
 ALPHA = 1e-4  # of each test, after Bonferroni's correction
 SIZE, BLOCK, SEEDS, SPP = 16, 4, 20, 48
 _ALIVE: list = []  # scenes: one freed while a kernel is recorded ends the process

@@ -24,7 +24,7 @@ from nlt.models.plain import plain
 from nlt.models.policy import Policy
 
 pytest_plugins = ["training_fixtures"]
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 GRID = {"resolution": (8,), "points": (32,), "photons": (32,), "width": (4,), "batch": (2,)}
 METHODS = ("cnn", "nlt_photons", "oidn_1")

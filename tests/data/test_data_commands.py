@@ -18,6 +18,8 @@ from nlt.data.sample import FIELDS
 from nlt.data.spec import FORMAT
 from nlt.data.store import pilot_name, write_manifest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def verify(dataset, tmp_path, capfd):

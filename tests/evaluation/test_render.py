@@ -28,7 +28,7 @@ from nlt.rendering.renderer import Renderer
 from nlt.scenes.trajectory import cameras, follow, states, turn
 
 pytest_plugins = ["training_fixtures"]
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 CPU = torch.device("cpu")
 SIZE = (16, 12)  # width, height
 

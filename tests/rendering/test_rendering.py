@@ -25,6 +25,8 @@ from nlt.scenes.description import MOVING_LIGHT, load_description
 from nlt.scenes.lanes import is_jit
 from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
 
+pytestmark = pytest.mark.slow
+
 # What mi.render's moments are in.
 XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 GLASS = ("dielectric", "thindielectric", "roughdielectric")

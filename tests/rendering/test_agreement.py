@@ -18,6 +18,8 @@ from nlt.scenes.description import load_description
 from nlt.scenes.lanes import is_jit
 from nlt.scenes.state import sample_state, sample_view
 
+pytestmark = pytest.mark.slow
+
 # ---- photons --------------------------------------------------------------------------------------------
 
 SKY = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32) ** 4 * 20

@@ -48,7 +48,7 @@ from nlt.report.figures import curves
 from nlt.report.gallery import Shown, worst_pixels
 
 pytest_plugins = ["training_fixtures"]
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 CPU = torch.device("cpu")
 ACCURACY = ("mse", "unbiased_mse", "reference_noise", "mssim", "fid", "feature_l1")

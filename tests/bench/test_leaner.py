@@ -13,6 +13,8 @@ from nlt.evaluation.results import load, write_manifest
 from nlt.paths import PROJECT
 from nlt.report.figures import curves, draw_speed_accuracy
 
+pytestmark = pytest.mark.slow
+
 MSE = {"tiny": 0.04, "small": 0.02, "medium": 0.01, "large": 0.01, "paper": 0.01}
 
 

@@ -37,6 +37,8 @@ from nlt.select.choice import choose, paired_difference, ranked, within
 from nlt.select.space import SearchSpace
 from nlt.waiting import WAIT_POLICY
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = ["training_fixtures"]
 
 # ---- what varies ----------------------------------------------------------------------------------------

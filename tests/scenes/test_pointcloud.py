@@ -16,6 +16,8 @@ from nlt.scenes.description import MATERIALS, MOVING_LIGHT, load_description
 from nlt.scenes.pointcloud import material, sample_points
 from nlt.scenes.state import rest_state
 
+pytestmark = pytest.mark.slow
+
 COUNT = 20_000
 
 

@@ -20,7 +20,7 @@ from nlt.scenes.description import load_description
 from nlt.scenes.state import sample_state, sample_view
 
 ROOM = ("floor", "ceiling", "wall_left", "wall_right", "wall_back", "wall_front")
-CONFIGS = Path(__file__).parents[1] / "configs" / "scenes"
+CONFIGS = Path(__file__).parents[2] / "configs" / "scenes"
 
 
 @pytest.fixture(scope="module", params=sorted(BUILTINS))

@@ -11,6 +11,8 @@ from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
 from nlt.scenes.pointcloud import sample_points
 
+pytestmark = pytest.mark.slow
+
 HEIGHT, COLOUR = 1.5, [0.1, 0.2, 0.3]
 DIFFUSE = f"""<bsdf type="twosided"><bsdf type="diffuse">
     <rgb name="reflectance" value="{", ".join(map(str, COLOUR))}"/></bsdf></bsdf>"""

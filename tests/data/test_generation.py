@@ -31,6 +31,8 @@ from nlt.errors import UserError
 from nlt.paths import PROJECT
 from nlt.scenes.lanes import is_jit
 
+pytestmark = pytest.mark.slow
+
 # ---- determinism and interruption -----------------------------------------------------------------------
 
 

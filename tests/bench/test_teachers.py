@@ -11,6 +11,8 @@ from nlt.bench.teachers import _SPP, _figures
 from nlt.cli import main
 from nlt.scenes.lanes import is_jit
 
+pytestmark = pytest.mark.slow
+
 SIZE, VIEWS, RENDERS = 16, 3, 40
 
 

@@ -16,6 +16,8 @@ from nlt.scenes.pointcloud import surface
 from nlt.scenes.state import SceneState, rest_state, sample_state, sample_view
 from nlt.scenes.views import Views
 
+pytestmark = pytest.mark.slow
+
 NAMES = [name for name in config_names("scenes") if name.startswith("real/")]
 
 

@@ -15,6 +15,8 @@ from nlt.scenes.lanes import is_jit
 from nlt.scenes.pointcloud import sample_points
 from nlt.scenes.state import rest_state, sample_state, sample_view
 
+pytestmark = pytest.mark.slow
+
 NEAR = 0.5  # pixel footprints
 
 

@@ -19,6 +19,8 @@ from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
 from nlt.paths import CONFIGS, PROJECT
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = ["training_fixtures"]
 
 
