@@ -59,7 +59,6 @@ ELSEWHERE = {
     "nlt compare --config demo --data room": "test_compare.py::test_table",
     "nlt select --config demo --minutes 6": "test_select.py::test_end_to_end",
     "nlt render --demo": "test_render.py::test_demo",
-    "nlt report results/table2": "test_compare.py::test_drawing_again_changes_no_byte",
 }
 
 
