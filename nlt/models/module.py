@@ -183,14 +183,17 @@ class RenderingModule(Method, L.LightningModule):
         camera = (batch["camera_matrix"], batch["world_to_view"])
         return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
-    def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud]) -> Features:
-        """Return the G-buffer followed by one map per cloud; one mean over all would mix their kinds of feature."""
+    def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud], maps: Sequence[Tensor] = ()) -> Features:
+        """Return the G-buffer followed by one map per cloud; one mean over all would mix their kinds of feature.
+
+        `maps` are appended; they exist only while gradients are wanted, and then no map is sparse.
+        """
         gbuffer = self.gbuffer(batch)
         if project_sparsely(max((len(valid[0]) for *_, valid in clouds), default=0), gbuffer[0, 0].numel()):
             view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
             projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
             return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]
-        return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds)])
+        return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds), *maps])
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.data.sample import MATERIALS
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, join, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, log_exposed
 from nlt.models.projection import average_rows, visible_pixels
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
@@ -92,11 +92,8 @@ class NeuralLightTransport(RenderingModule):
             clouds.append((points, batch["point_position"], batch["point_visible"]))
         if photons is not None:
             clouds.append((photons, batch["photon_hit"], batch["photon_valid"]))
-        maps = self.gbuffer_and(batch, clouds)
-        if not self.hparams["photons"] or photons is not None:
-            return maps
-        assert isinstance(maps, Tensor)  # maps are sparse only without gradients
-        return join([maps, self._seen_photons(batch)])
+        delayed = self.hparams["photons"] and photons is None
+        return self.gbuffer_and(batch, clouds, [self._seen_photons(batch)] if delayed else ())
 
     def _seen_photons(self, batch: Batch) -> Tensor:
         """Return the photons' map (B, photon_width, H, W), computing features only for photons that the view sees."""
