@@ -31,11 +31,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.data.generate import generate
-from nlt.data.spec import DatasetSpec, load_spec, read_configs
+from nlt.data.spec import DatasetSpec, load_spec
 from nlt.data.store import dataset_files
 from nlt.errors import UserError
 from nlt.evaluation.provenance import origin, surroundings

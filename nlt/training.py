@@ -19,8 +19,8 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from PIL import Image
 
+from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
-from nlt.data.spec import read_configs
 from nlt.errors import UserError
 from nlt.metrics.display import display
 from nlt.models.image_grid import ImageGrid

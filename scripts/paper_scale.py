@@ -8,7 +8,8 @@ import json
 import sys
 from pathlib import Path
 
-from nlt.data.spec import load_spec, read_configs
+from nlt.config import read_configs
+from nlt.data.spec import load_spec
 from nlt.paths import PROJECT, find_config
 
 METHODS = 9  # in the paper's Table 2

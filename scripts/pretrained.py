@@ -12,8 +12,8 @@ import json
 import sys
 from pathlib import Path
 
+from nlt.config import read_configs
 from nlt.data.files import write_bytes
-from nlt.data.spec import read_configs
 from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.render import DEMO

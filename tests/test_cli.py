@@ -13,9 +13,10 @@ from tiny import DATASET, SCALE, copy_dataset, write
 
 from nlt import waiting
 from nlt.cli import _parser, main
+from nlt.config import merge
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
-from nlt.data.spec import DATA, merge
+from nlt.data.spec import DATA
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = pytest.mark.usefixtures("one_thread")

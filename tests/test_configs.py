@@ -2,7 +2,8 @@
 
 import pytest
 
-from nlt.data.spec import load_spec, read_configs
+from nlt.config import read_configs
+from nlt.data.spec import load_spec
 from nlt.paths import config_names, find_config, scenes_root
 
 PAPER = {  # its experiments: how many scenes, how they change; the scale; resolution, iterations and batch size

@@ -9,7 +9,7 @@ import lightning as L
 import yaml
 from torch.nn import functional as F
 
-from nlt.data.spec import merge
+from nlt.config import merge
 from nlt.metrics import image_metrics
 from nlt.metrics.inception import STAGES
 

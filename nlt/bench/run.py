@@ -24,12 +24,13 @@ from tqdm import tqdm
 from nlt.bench import ceilings
 from nlt.bench.bare import Bare
 from nlt.bench.output import BENCH, write_report
+from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.generate import fill, plan
 from nlt.data.render import SampleRenderer
-from nlt.data.spec import DatasetSpec, load_spec, read_configs
+from nlt.data.spec import DatasetSpec, load_spec
 from nlt.data.stats import laps, timed_spp
 from nlt.data.store import missing_files, write_manifest, write_shard
 from nlt.errors import UserError

@@ -9,12 +9,11 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
+from nlt.config import read_configs
 from nlt.data.files import AnyPath, open_path
 from nlt.data.sample import FIELDS, SPLITS, Field
 from nlt.errors import UserError
@@ -197,34 +196,6 @@ class Shard:
     def name(self) -> str:
         """The file's name, relative to the dataset's directory."""
         return f"{self.split}/{self.scene:03d}-{self.start:07d}.safetensors"
-
-
-def read_configs(files: list[str]) -> dict[str, Any]:
-    """Merge YAML configs; later files override earlier ones.
-
-    Raises:
-        UserError: a file is missing or is not YAML.
-    """
-    merged: dict[str, Any] = {}
-    for file in files:
-        try:
-            data = yaml.safe_load(Path(file).read_text()) or {}
-        except OSError as error:
-            raise UserError(f"{file}: cannot be read: {error.strerror}") from None
-        except yaml.YAMLError as error:
-            raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
-        if not isinstance(data, Mapping):
-            raise UserError(f"{file}: must be a mapping, is a {type(data).__name__}")
-        merged = merge(merged, data)
-    return merged
-
-
-def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` overridden by `over`, merging nested mappings."""
-    both = {
-        k: merge(base[k], v) for k, v in over.items() if isinstance(v, Mapping) and isinstance(base.get(k), Mapping)
-    }
-    return {**base, **over, **both}
 
 
 def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], needed: Collection[str] = ()) -> None:

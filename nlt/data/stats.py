@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from nlt.config import read_configs
 from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB
 from nlt.data.render import SampleRenderer
-from nlt.data.spec import DatasetSpec, read_configs
+from nlt.data.spec import DatasetSpec
 from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
 from nlt.paths import CONFIGS

@@ -10,10 +10,11 @@ from typing import Any
 
 import torch
 
+from nlt.config import read_configs
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Died
 from nlt.data.generate import generate
-from nlt.data.spec import load_spec, read_configs
+from nlt.data.spec import load_spec
 from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation import live

@@ -6,7 +6,8 @@ import pydoc
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from nlt.data.spec import check_keys, read_configs
+from nlt.config import read_configs
+from nlt.data.spec import check_keys
 from nlt.errors import UserError
 from nlt.evaluation.paper import order, tables
 from nlt.models.method import Method

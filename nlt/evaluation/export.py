@@ -13,10 +13,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.files import write_bytes
 from nlt.data.sample import BATCH_FIELDS, FIELDS
-from nlt.data.spec import DatasetSpec, read_configs
+from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 import yaml
 
+from nlt.config import merge, read_configs
 from nlt.data.engines import find_engine
 from nlt.data.files import write_bytes
-from nlt.data.spec import merge, read_configs
 from nlt.errors import DivergedError, UserError, to_user_error
 from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen

@@ -9,8 +9,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from nlt.config import merge, read_configs
 from nlt.data.files import AnyPath
-from nlt.data.spec import DatasetSpec, check_keys, load_spec, merge, read_configs
+from nlt.data.spec import DatasetSpec, check_keys, load_spec
 from nlt.errors import UserError
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config

@@ -14,9 +14,9 @@ import yaml
 from torch.utils.data import DataLoader
 
 from nlt import training
+from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
-from nlt.data.spec import merge
 from nlt.errors import DivergedError
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nlt.config import read_configs
 from nlt.data.files import AnyPath, open_path
-from nlt.data.spec import DatasetSpec, check_keys, read_configs
+from nlt.data.spec import DatasetSpec, check_keys
 from nlt.errors import UserError
 from nlt.paths import find_config
 

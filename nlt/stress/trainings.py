@@ -12,9 +12,9 @@ import lightning as L
 import torch
 import yaml
 
+from nlt.config import merge, read_configs
 from nlt.data.engines import available_cpus
 from nlt.data.files import write_bytes
-from nlt.data.spec import merge, read_configs
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows

@@ -25,10 +25,11 @@ from torch.utils.data import default_collate
 from nlt import paths, training
 from nlt.baselines.cnn import CNN
 from nlt.cli import main
+from nlt.config import merge
 from nlt.data import engines
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
-from nlt.data.spec import DatasetSpec, merge
+from nlt.data.spec import DatasetSpec
 from nlt.evaluation import clock, compare, comparison, progress
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
@@ -799,7 +800,9 @@ def test_drawing_again_changes_no_byte(made, tmp_path):
 
 
 def test_without_images_the_rest_is_drawn(made, tmp_path):
-    copy = shutil.copytree(made.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("images", "*.png", "*.webp"))
+    copy = shutil.copytree(
+        made.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("images", "*.png", "*.webp")
+    )
     assert main(["report", str(copy)]) == 0
     assert (copy / "speed_accuracy.png").exists() and not (copy / "samples.webp").exists()
 

@@ -19,11 +19,12 @@ from tiny import SCALE, write
 
 from nlt.baselines.feature_projection import FeatureProjection
 from nlt.cli import main
+from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Process
 from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
-from nlt.data.spec import DatasetSpec, merge
+from nlt.data.spec import DatasetSpec
 from nlt.evaluation import clock
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport

@@ -17,8 +17,8 @@ from safetensors import safe_open
 from synthetic import PHOTONS, POINTS, synthetic_batch
 
 from nlt.cli import main
+from nlt.config import merge
 from nlt.data.render import SampleRenderer
-from nlt.data.spec import merge
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import read_rows, write_manifest, write_rows
