@@ -24,6 +24,7 @@ from tqdm import tqdm
 from nlt.bench import ceilings
 from nlt.bench.bare import Bare
 from nlt.bench.output import BENCH, write_report
+from nlt.bench.plain import plain
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
@@ -42,8 +43,7 @@ from nlt.evaluation.provenance import origin, surroundings
 from nlt.metrics.quantities import NETWORK_STAGES
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
-from nlt.models.plain import plain
-from nlt.models.policy import default_device
+from nlt.models.policy import Policy, accelerate, default_device
 from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
 from nlt.training import load_method, quiet, trainer_defaults
@@ -316,9 +316,10 @@ class _Bench:
         clock = Clock(self.frames(self.settings, self._count()), self.device, self.settings["batch"])
         method = self.method(name, self.settings)
         if not isinstance(method, RenderingModule):
-            timed = clock.time_interleaved({"": method}, self.seconds)[""]
+            timed = clock.time_interleaved({"": method.eval()}, self.seconds)[""]
             return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
-        timed, slow = clock.time_interleaved({"": method, "plain": plain(method)}, 2 * self.seconds).values()
+        fast = accelerate(method, Policy.for_device(self.device), self.device)
+        timed, slow = clock.time_interleaved({"": fast, "plain": plain(method)}, 2 * self.seconds).values()
         network = [[_network(frame) for frame in path] for path in (slow, timed)]
         ratios = [s / t for s, t in zip(*network, strict=True)]
         speedup = dict(zip(("p5", "median", "p95"), np.percentile(ratios, (5, 50, 95)).tolist(), strict=True))
@@ -355,7 +356,7 @@ class _Bench:
         count = LEAST_FRAMES if part.factor in _DATASET and settings != self.settings else self._count()
         clock = Clock(self.frames(settings, count), self.device, settings["batch"])
         method = self.method(part.method, settings)
-        timed = clock.time_interleaved({"": method}, self.seconds)[""]
+        timed = clock.time_interleaved({"": method.eval()}, self.seconds)[""]
         return summary(timed) | {"timed_frames": len(timed)} | clock.size(method)
 
     def _training(self, name: str, frame: Mapping[str, Any]) -> dict[str, Any]:

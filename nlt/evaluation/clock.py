@@ -6,7 +6,6 @@ import math
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,7 +22,7 @@ from nlt.evaluation.frames import Frames
 from nlt.metrics.quantities import STATE_STAGES
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 
 WARM_UP, FRAMES, LEAST_FRAMES = 10, 40, 3
 _WARM_UP_SHARE = 0.2  # of the time limit
@@ -45,25 +44,26 @@ class Clock:
 
     def time(self, method: Method) -> dict[str, Any]:
         """Return the seconds per stage and per frame (see `summary`) over 40 frames, after 10 warm-up frames."""
-        return summary(self.time_interleaved({"": method})[""])
+        return summary(self.time_interleaved({"": self._accelerated(method)})[""])
 
     def time_interleaved(
         self, methods: Mapping[str, Method], seconds: float = math.inf
     ) -> dict[str, list[dict[str, float]]]:
         """Return the seconds per stage of every timed frame, by method, from interleaved timing.
 
+        The methods are on the clock's device already, accelerated or not.
+
         The methods take turns on each frame, so that other load on the machine slows all of them alike. The device is
         synchronised around every stage. There are 10 warm-up and 40 timed frames, fewer if `seconds` run out, but at
         least 2 and 3.
         """
-        methods = {name: method.to(self.device).eval() for name, method in methods.items()}
         rows = np.linspace(0, len(self.dataset) - 1, min(len(self.dataset), WARM_UP + FRAMES)).astype(int)
         # The scenes are interleaved, so that the warm-up compiles the kernels of each.
         stride = math.ceil(len(rows) / len(self.dataset.spec.scenes))
         rows = np.concatenate([rows[first::stride] for first in range(stride)])
         timed: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
         start, row_number = time.perf_counter(), 0
-        with torch.inference_mode(), self.policy.applied(self.device):
+        with torch.inference_mode():
             for maximum, minimum, share in ((WARM_UP, min(WARM_UP, 2), _WARM_UP_SHARE), (FRAMES, LEAST_FRAMES, 1)):
                 for laps in timed.values():
                     laps.clear()
@@ -99,6 +99,9 @@ class Clock:
             result = self._timed(seconds, name, partial(step, batch, result))
         return seconds
 
+    def _accelerated(self, method: Method) -> Method:
+        return accelerate(method, self.policy, self.device)
+
     def _batch(self, indices: Sequence[int]) -> Batch:
         return {k: v.to(self.device) for k, v in default_collate([self.dataset[index] for index in indices]).items()}
 
@@ -125,26 +128,26 @@ class Clock:
         sizes: dict[str, Any] = {"parameters": sum(p.numel() for p in parameters)}
         if not isinstance(method, RenderingModule):
             return sizes
-        method = method.to(self.device).eval()
+        flops = sum(self.flops(method).values())
+        method = self._accelerated(method)
         batch = self._inputs(method)
         memory = _AliveMemory()
         cuda = self.device.type == "cuda"
         if cuda:
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        with torch.no_grad(), self.policy.applied(self.device), memory:
+        with torch.no_grad(), memory:
             method(batch)
         peak = torch.cuda.max_memory_allocated(self.device) - before if cuda else memory.peak
         held_bytes = sum(t.numel() * t.element_size() for t in [*parameters, *batch.values()])
-        return sizes | {"flops": sum(self.flops(method).values()), "peak_memory_bytes": held_bytes + peak}
+        return sizes | {"flops": flops, "peak_memory_bytes": held_bytes + peak}
 
     @torch.no_grad()
     def flops(self, method: RenderingModule) -> dict[str, int]:
         """Return the FLOPs of a batch's convolutions and matrix products by step, without sparse or int8 shortcuts."""
         batch, result, flops = self._inputs(method), None, {}
-        dense_policy = replace(self.policy, sparse=False, int8=False)
         for name, step in method.to(self.device).eval().steps().items():
-            with dense_policy.applied(self.device), FlopCounterMode(display=False) as counter:
+            with FlopCounterMode(display=False) as counter:
                 result = step(batch, result)
             flops[name] = counter.get_total_flops()
         return flops

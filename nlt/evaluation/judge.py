@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
+from nlt.baselines.path_tracing import PathTracing
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError
+from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.results import write_images
 from nlt.metrics.image_metrics import ImageMetrics
@@ -24,7 +26,7 @@ from nlt.metrics.jackknife import fid_and_kid_without
 from nlt.metrics.quantities import OF_HALVES
 from nlt.models.method import Batch, Method
 from nlt.models.module import PROJECTION
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 from nlt.models.projection import visible_pixels
 
 _SHOWN = 32  # test views whose images are stored
@@ -67,52 +69,45 @@ class Evaluation:
         pixels = visible_pixels(batch["point_position"], emits, **camera)
         return (pixels < batch["depth"][0].numel()).any(1).numpy()
 
-    @torch.inference_mode()
     def floor(self) -> tuple[dict[str, float], dict[str, float]]:
         """Return the metrics of the reference's half A, judged as a prediction against half B, and each scene's MSE.
 
         Metrics that need two independent halves of a reference and metrics that are not finite are left out.
         """
-        metrics = ImageMetrics(perceptual=True).to(self.device)
-        dataset = LightTransportDataset(self.directory, self.spec, "test", ())
-        mse: list[float] = []
-        for batch in DataLoader(dataset, batch_size=_BATCH, collate_fn=identity_collate):
-            a, b, exposure = (batch[name].to(self.device) for name in ("reference_a", "reference_b", "exposure"))
-            mse += metrics.update(a, b, b, exposure)["mse"].tolist()
+        metrics, mse = ImageMetrics(perceptual=True).to(self.device), list[float]()
+        halves = (
+            {**batch, "traced": batch["reference_a"], "reference_a": batch["reference_b"]}
+            for batch in self._batches(())
+        )
+        for judged in evaluate(PathTracing(), halves, metrics):
+            mse += judged.metrics["mse"].tolist()
         values = {name: float(value) for name, value in metrics.compute().items() if name not in OF_HALVES}
         by_scene = np.reshape(mse, (-1, self.spec.test)).mean(1).tolist()
         names = [description.name for description in self.spec.descriptions]
         return {k: v for k, v in values.items() if math.isfinite(v)}, dict(zip(names, by_scene, strict=True))
 
-    @torch.inference_mode()
     def evaluate(self, method: Method) -> tuple[dict[str, float], list[dict[str, Any]], np.ndarray]:
         """Return a method's metrics, its metrics for each view, and its radiance (V, 3, H, W) of the shown views.
 
         Raises:
             DivergedError: a prediction is not finite.
         """
-        method = method.to(self.device).eval()
+        method = accelerate(method, self.policy, self.device)
         metrics = ImageMetrics(perceptual=True).to(self.device)
-        dataset = LightTransportDataset(self.directory, self.spec, "test", method.fields)
         shown, rows = [], []
         pools: list[tuple[Tensor, Tensor]] = []
-        for k, cpu_batch in enumerate(DataLoader(dataset, batch_size=_BATCH, collate_fn=identity_collate)):
-            indices = cpu_batch["index"].tolist()
-            if "traced" in method.fields and method.spp:
-                cpu_batch["traced"] = torch.stack([self.frames.traced(index, method.spp) for index in indices])
-            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            with self.policy.applied(self.device):  # the same computation that is timed
-                prediction = method(batch)
-            if not prediction.isfinite().all():
+        batches = self._batches(method.fields, method.spp if "traced" in method.fields else None)
+        for k, judged in enumerate(evaluate(method, batches, metrics, self._reference_features)):
+            indices = judged.batch["index"].tolist()
+            if judged.nonfinite.any():
                 raise DivergedError(f"a prediction is not finite in test samples {indices}")
-            reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
-            features = self._reference_features(k, reference)
-            batch_metrics = metrics.update(prediction, *reference, of_reference=features)
-            if features and "pool" in batch_metrics:
-                pools.append((batch_metrics.pop("pool"), features["pool"]))
-            columns = {name: values.tolist() for name, values in batch_metrics.items()}
+            if "pool" in judged.metrics:
+                features = self._reference_features(k, judged.batch)
+                assert features is not None
+                pools.append((judged.metrics.pop("pool"), features["pool"]))
+            columns = {name: values.tolist() for name, values in judged.metrics.items()}
             rows += [{"view": index, **{n: c[i] for n, c in columns.items()}} for i, index in enumerate(indices)]
-            shown.append(prediction[[i for i, index in enumerate(indices) if index in self.shown]].cpu())
+            shown.append(judged.radiance[[i for i, index in enumerate(indices) if index in self.shown]].cpu())
         if pools:
             without = fid_and_kid_without(*(torch.cat(part) for part in zip(*pools, strict=True)))
             for key, column in without.items():
@@ -141,7 +136,16 @@ class Evaluation:
             write_bytes(kept, file.getvalue())
         return metrics, views, radiance
 
-    def _reference_features(self, k: int, reference: tuple[Tensor, Tensor, Tensor]) -> dict[str, Tensor] | None:
+    def _batches(self, fields: tuple[str, ...], spp: int | None = None) -> Iterator[Batch]:
+        """Yield the test split's batches with the `fields` and, with `spp`, "traced" rendered at as many samples."""
+        dataset = LightTransportDataset(self.directory, self.spec, "test", fields)
+        for batch in DataLoader(dataset, batch_size=_BATCH, collate_fn=identity_collate):
+            if spp:
+                batch["traced"] = torch.stack([self.frames.traced(index, spp) for index in batch["index"].tolist()])
+            yield batch
+
+    def _reference_features(self, k: int, batch: Batch) -> dict[str, Tensor] | None:
+        reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
         if len(self) > _MAX_CACHED:
             return ImageMetrics.reference_features(*reference, cached=False)
         if k not in self._features:

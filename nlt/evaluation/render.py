@@ -33,7 +33,7 @@ from nlt.metrics.display import display
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
-from nlt.models.policy import Policy, default_device
+from nlt.models.policy import Policy, accelerate, default_device
 from nlt.paths import find_config
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
@@ -168,13 +168,13 @@ def render(
     if missing:
         device = default_device()
         policy = Policy.for_device(device)
-        model = ModelRenderer(method, spec, index, device)
+        model = ModelRenderer(accelerate(method, policy, device), spec, index, device)
         if method.has_point_embeddings and points and points_crc(model.points) != points[index]:
             raise UserError(
                 f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
                 f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
             )
-        with torch.no_grad(), policy.applied(device):
+        with torch.no_grad():
             if not manifest:
                 times = _measure(model, scene_states, views, spp)
                 manifest = {"key": key, **provenance, **surroundings(device, policy), "checkpoint": checkpoint, **times}

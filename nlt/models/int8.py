@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import MutableMapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+# Input channels and products per image from which 8-bit integers are faster (docs/performance.md).
+LEAST_CHANNELS, _LEAST_PRODUCTS = 64, 1e8
 _STEPS = 253  # steps of an input, at least; in bfloat16, 255 plus the half for rounding is 256, which wraps to 0
 _LEAST = 1e-30  # lower bound on an image's maximum, by which its scale is divided
 _BLOCK = 1 << 20  # values rounded at a time: few enough for the cache, enough for several threads
@@ -36,14 +37,26 @@ def pack(conv: nn.Conv2d) -> PackedWeights:
     )
 
 
-def convolve(conv: nn.Conv2d, x: Tensor, packed: MutableMapping[nn.Module, PackedWeights], relu: bool) -> Tensor:
-    """Return conv(x) in bfloat16, followed by a ReLU if `relu`; x (B, C, H, W) is bfloat16 and not negative.
+class Int8Conv2d(nn.Module):
+    """A 3x3 convolution for inference on inputs that are not negative, in 8-bit integers where that is faster."""
 
-    Every image of x is rounded to 253 steps of its largest value, or one more. `packed` caches the packed weights.
+    def __init__(self, conv: nn.Conv2d) -> None:
+        super().__init__()
+        self.packed = pack(conv)
+        self.conv = conv
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the convolution of x (B, C, H, W); in 8-bit integers, it is bfloat16."""
+        enough = self.conv.weight.numel() * x[0, 0].numel() >= _LEAST_PRODUCTS
+        return convolve(self.conv, x.to(torch.bfloat16), self.packed) if enough else self.conv(x)
+
+
+def convolve(conv: nn.Conv2d, x: Tensor, packed: PackedWeights) -> Tensor:
+    """Return conv(x) in bfloat16; x (B, C, H, W) is bfloat16 and not negative.
+
+    Every image of x is rounded to 253 steps of its largest value, or one more.
     """
-    if conv not in packed:
-        packed[conv] = pack(conv)
-    weights, scales, zeros, bias = packed[conv]
+    weights, scales, zeros, bias = packed
     images = []
     for image in x.split(1):  # one scale per image, so that an image does not depend on its batch
         top = image.amax().float().clamp(min=_LEAST)
@@ -52,7 +65,7 @@ def convolve(conv: nn.Conv2d, x: Tensor, packed: MutableMapping[nn.Module, Packe
         images.append(
             torch.ops.onednn.qconv2d_pointwise(
                 _rounded(image, steps), step, 0, weights, scales, zeros, bias, *_geometry(conv), 1,
-                1.0, 0, torch.bfloat16, "relu" if relu else "none", [], "",
+                1.0, 0, torch.bfloat16, "none", [], "",
             )
         )  # fmt: skip
     return images[0] if len(images) == 1 else torch.cat(images)

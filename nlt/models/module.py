@@ -19,7 +19,6 @@ from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
 from nlt.models.method import Batch, Method
-from nlt.models.policy import project_sparsely
 from nlt.models.projection import SparseMap, average_sparsely, project, visible_pixels
 from nlt.models.transport import PointEmbedding
 from nlt.models.unet import UNet
@@ -33,6 +32,7 @@ GBUFFER_CHANNELS = 10
 _WARM_UP = 0.05  # share of the steps, with lr_schedule "cosine"
 
 Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), validity (B, N)
+Steps = dict[str, Callable[[Batch, Any], Any]]
 Features = Tensor | tuple[Tensor, list[SparseMap]]
 
 # Values of these hyperparameters in checkpoints that were written before they could be chosen.
@@ -72,6 +72,9 @@ class RenderingModule(Method, L.LightningModule):
 
     # Hyperparameters that a checkpoint must share to be loaded.
     architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission")
+    # Fast paths at inference, which `nlt.models.policy.accelerate` switches on; see `Policy`.
+    sparse = in_bfloat16 = False
+    projection: Callable[..., Tensor] = staticmethod(project)
 
     def __init__(
         self,
@@ -168,7 +171,7 @@ class RenderingModule(Method, L.LightningModule):
     def features(self, batch: Batch, transported: Any = None) -> Features:
         """Return the U-Net's input (B, feature_channels, H, W), from the batch and the result of `transport`.
 
-        With `nlt.models.policy.Policy.sparse`, return the input's first channels and sparse maps of the others.
+        With `sparse`, return the input's first channels and sparse maps of the others.
         """
         raise NotImplementedError
 
@@ -181,7 +184,7 @@ class RenderingModule(Method, L.LightningModule):
     def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
         """Project features (B, N, C) at positions (B, N, 3) to (B, C, H, W) by Eq. (1), with the batch's camera."""
         camera = (batch["camera_matrix"], batch["world_to_view"])
-        return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
+        return self.projection(features, positions, valid, *camera, batch["depth"], batch["normal"])
 
     def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud], maps: Sequence[Tensor] = ()) -> Features:
         """Return the G-buffer followed by one map per cloud; one mean over all would mix their kinds of feature.
@@ -189,7 +192,8 @@ class RenderingModule(Method, L.LightningModule):
         `maps` are appended; they exist only while gradients are wanted, and then no map is sparse.
         """
         gbuffer = self.gbuffer(batch)
-        if project_sparsely(max((len(valid[0]) for *_, valid in clouds), default=0), gbuffer[0, 0].numel()):
+        # With more points than pixels, dense maps are faster (docs/performance.md).
+        if self.sparse and gbuffer[0, 0].numel() >= max((len(valid[0]) for *_, valid in clouds), default=0):
             view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
             projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
             return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]
@@ -235,11 +239,12 @@ class RenderingModule(Method, L.LightningModule):
             batch["photon_flux"] = batch["photon_flux"] * (total / photons)
         return batch
 
-    def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
+    def steps(self) -> Steps:
         """Return the steps "transport", "projection" and "synthesis"."""
         transport = lambda batch, _: self.transport(self.subsample(batch))
         features = lambda batch, transported: self.features(self.subsample(batch), transported)
-        return {"transport": transport, "projection": features, "synthesis": self.synthesize}
+        steps: Steps = {"transport": transport, "projection": features, "synthesis": self.synthesize}
+        return {name: _in_bfloat16(step) for name, step in steps.items()} if self.in_bfloat16 else steps
 
     # --- training and evaluation ---
 
@@ -363,6 +368,14 @@ class RenderingModule(Method, L.LightningModule):
         if not (isinstance(method, type) and issubclass(method, cls)):
             raise _wrong_method(checkpoint_path, checkpoint, cls)
         return super(RenderingModule, method).load_from_checkpoint(checkpoint_path, *args, **kwargs)
+
+
+def _in_bfloat16(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], Any]:
+    def run(batch: Batch, result: Any) -> Any:
+        with torch.autocast(batch["exposure"].device.type, torch.bfloat16):
+            return step(batch, result)
+
+    return run
 
 
 def _wrong_method(path: str | Path | None, checkpoint: dict[str, Any], wanted: type) -> UserError:

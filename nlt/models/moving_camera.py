@@ -25,8 +25,9 @@ class MovingCamera:
     @torch.no_grad()
     def __call__(self, batch: Batch) -> Tensor:
         """Return the radiance (B, 3, H, W) of a batch, as the method does."""
+        steps = self.method.steps()
         state = {name: batch[name] for name in self.method.state_inputs}
         if state.keys() != self._state.keys() or not all(torch.equal(state[name], self._state[name]) for name in state):
-            self._transported = self.method.transport(state)
+            self._transported = steps["transport"](state, None)
             self._state = {name: value.clone() for name, value in state.items()}  # the batch may change in place
-        return self.method.synthesize(batch, self.method.features(batch, self._transported))
+        return steps["synthesis"](batch, steps["projection"](batch, self._transported))

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+import copy
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import nn
 
-from nlt.models import int8
+from nlt.models.int8 import LEAST_CHANNELS, Int8Conv2d
+from nlt.models.method import Method
+from nlt.models.module import RenderingModule
+from nlt.models.unet import ConvBlock
 
-# Below this, dense maps are faster: measured at 64x64 to 1024x1024, widths 8 to 64 (docs/performance.md).
-_PIXELS_PER_POINT = 1
-_sparse: ContextVar[bool] = ContextVar("sparse", default=False)
-# Input channels and products per image from which 8-bit integers are faster (docs/performance.md).
-_LEAST_CHANNELS, _LEAST_PRODUCTS = 64, 1e8
-_packed: ContextVar[dict[nn.Module, int8.PackedWeights] | None] = ContextVar("packed", default=None)
+AnyMethod = TypeVar("AnyMethod", bound=Method)
 
 
 def default_device() -> torch.device:
@@ -38,36 +34,20 @@ def fast_int8(device: torch.device) -> bool:
     return device.type == "cpu" and any("vnni" in name and has for name, has in torch.cpu.get_capabilities().items())
 
 
-def convolve(conv: nn.Conv2d, x: Tensor, relu: bool = False) -> Tensor:
-    """Return conv(x), followed by a ReLU if `relu`; x (B, C, H, W) is not negative. See `Policy.int8`."""
-    packed, products = _packed.get(), conv.weight.numel() * x[0, 0].numel()
-    enough = conv.in_channels >= _LEAST_CHANNELS and products >= _LEAST_PRODUCTS
-    if packed is not None and enough and not torch.is_grad_enabled():
-        return int8.convolve(conv, x.to(torch.bfloat16), packed, relu)
-    y = conv(x)
-    return F.relu(y, inplace=True) if relu else y
-
-
-def project_sparsely(points: int, pixels: int) -> bool:
-    """Return whether a cloud is projected as a sparse map, by its number of points and the pixels; see `Policy`."""
-    return _sparse.get() and not torch.is_grad_enabled() and pixels >= _PIXELS_PER_POINT * points
-
-
 @dataclass(frozen=True)
 class Policy:
     """The precision and fast paths with which methods are trained, timed and evaluated. The default is float32.
 
     `bfloat16`: convolutions and linear layers run under autocast. bfloat16 has the exponent of float32, so no loss is
-    scaled; weights, Adam's state, positions, projection, loss and metrics stay float32.
+    scaled; in training, weights and Adam's state stay float32, and so do positions, projection, loss and metrics.
 
-    `sparse`: with many pixels per point, projected features stay a list of rows, which the first convolution adds up;
-    never while gradients are recorded. Without it, as in an exported program, they become maps. Not tested on a GPU.
+    `sparse`: with many pixels per point, projected features stay a list of rows, which the first convolution adds up.
+    Not tested on a GPU.
 
-    `int8`: the large 3x3 convolutions of the U-Net's blocks run in 8-bit integers, the layers around them in bfloat16;
-    never while gradients are recorded, nor in an exported program.
+    `int8`: the large 3x3 convolutions of the U-Net's blocks run in 8-bit integers, the layers around them in bfloat16.
 
-    The convolutions' layout is channels_last either way; `nlt.models.plain` uses none of this. torch.compile and CUDA
-    graphs are not used: they were not tested on a GPU, and a machine without one may have no compiler.
+    The convolutions' layout is channels_last either way. torch.compile and CUDA graphs are not used: they were not
+    tested on a GPU, and a machine without one may have no compiler.
     """
 
     bfloat16: bool = False
@@ -86,13 +66,25 @@ class Policy:
         """The precision by the name that Lightning's trainer uses."""
         return "bf16-mixed" if self.bfloat16 else "32-true"
 
-    @contextmanager
-    def applied(self, device: torch.device) -> Iterator[None]:
-        """Apply the policy in a context; use one context for many frames, because it caches the converted weights."""
-        before, packed = _sparse.set(self.sparse), _packed.set({} if self.int8 else None)
-        try:
-            with torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
-                yield
-        finally:
-            _sparse.reset(before)
-            _packed.reset(packed)
+    def autocast(self, device: torch.device) -> torch.autocast:
+        """Return the context in which a training step runs."""
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16)
+
+
+def accelerate(method: AnyMethod, policy: Policy, device: torch.device) -> AnyMethod:
+    """Return the method for inference on a device: a trained one as a copy that takes the policy's fast paths."""
+    if not isinstance(method, RenderingModule):
+        return method.to(device).eval()
+    fast = copy.deepcopy(method).to(device).eval().requires_grad_(False)
+    fast.sparse, fast.in_bfloat16 = policy.sparse, policy.bfloat16
+    if policy.int8:
+        for block in (part for part in fast.modules() if isinstance(part, ConvBlock)):
+            for name in ("conv_0", "conv_1"):
+                conv = getattr(block, name)
+                if conv.in_channels >= LEAST_CHANNELS:
+                    setattr(block, name, Int8Conv2d(conv))
+    if policy.bfloat16:  # converted once here, instead of by autocast in every frame
+        for part in fast.modules():
+            if type(part) in (nn.Conv2d, nn.Linear):
+                part.to(torch.bfloat16)
+    return fast

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from nlt.models.policy import convolve
 from nlt.models.projection import SparseMap
 
 
@@ -27,7 +26,7 @@ class ConvBlock(nn.Module):
         return self._add_residual(self.shortcut(x), F.relu(x))
 
     def _add_residual(self, shortcut: Tensor, activated: Tensor) -> Tensor:
-        return shortcut + convolve(self.conv_1, convolve(self.conv_0, activated, relu=True))
+        return shortcut + self.conv_1(F.relu(self.conv_0(activated), inplace=True))
 
 
 class UpBlock(ConvBlock):

@@ -148,7 +148,7 @@ class Search:
         seconds = []
         for _ in range(3):
             begin = now()
-            with self.policy.applied(self.device):
+            with self.policy.autocast(self.device):
                 loss = module.loss(module(batch), batch["noisy"], batch["exposure"])
             optimizer.zero_grad()
             loss.backward()

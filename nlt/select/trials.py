@@ -18,10 +18,11 @@ from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError
+from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 from nlt.select.space import Candidate, SearchSpace
 from nlt.training import newest_checkpoint, read_checkpoint
 
@@ -88,7 +89,6 @@ class Trials:
             training.run_lightning(arguments)
         return steps - before
 
-    @torch.inference_mode()
     def score(self, candidate: Candidate, seed: int, split: str) -> Scores:
         """Return the scores of every image of a split.
 
@@ -97,16 +97,16 @@ class Trials:
         """
         checkpoint = newest_checkpoint(self.run_of(candidate, seed))
         assert checkpoint is not None
-        module = RenderingModule.load_from_checkpoint(checkpoint, map_location=self.device).eval()
-        metrics, batches = ImageMetrics(perceptual=False).to(self.device), []
-        for cpu_batch in DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=identity_collate):
-            batch = {name: value.to(self.device) for name, value in cpu_batch.items()}
-            with self.policy.applied(self.device):
-                prediction = module(batch)
-            if not prediction.isfinite().all():
-                raise DivergedError(f"a prediction is not finite among {split} samples {batch['index'].tolist()}")
-            batches.append(metrics.update(prediction, batch["reference_a"], batch["reference_b"], batch["exposure"]))
-        return {key: torch.cat([scores[key] for scores in batches]).tolist() for key in SCORES}
+        module = accelerate(RenderingModule.load_from_checkpoint(checkpoint), self.policy, self.device)
+        batches = DataLoader(self.split(split, module.fields), batch_size=_BATCH, collate_fn=identity_collate)
+        scores: dict[str, list[float]] = {key: [] for key in SCORES}
+        for judged in evaluate(module, batches, ImageMetrics(perceptual=False).to(self.device)):
+            if judged.nonfinite.any():
+                indices = judged.batch["index"].tolist()
+                raise DivergedError(f"a prediction is not finite among {split} samples {indices}")
+            for key, values in scores.items():
+                values += judged.metrics[key].tolist()
+        return scores
 
     def scores(self, candidate: Candidate, key: str, seeds: Sequence[int], steps: int) -> np.ndarray:
         """Return validation scores (S, N), seeds by images."""

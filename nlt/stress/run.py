@@ -23,7 +23,7 @@ from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
 from nlt.evaluation.trainings import Training, check, train
-from nlt.models.policy import Policy, default_device
+from nlt.models.policy import Policy, accelerate, default_device
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES
 from nlt.stress.figures import stress_section
@@ -82,7 +82,7 @@ def stress(
     device = default_device()
     policy = Policy.for_device(device, comparison.precision)
     directory = Path(out or Path("results") / comparison.name) / STRESS
-    suite_views = SuiteViews(rendered, spec, content, wanted, device, policy)
+    suite_views = SuiteViews(rendered, spec, content, wanted, device)
     record = {
         **begun, **surroundings(device, policy), "comparison": comparison.name, "dataset": dataset.name,
         "suites": rendered.name, "views": min(content.views, spec.test), "scenes": [d.name for d in spec.descriptions],
@@ -107,6 +107,7 @@ def stress(
             bar.write(f"left out: {record['left_out'][-1]}")
             bar.update(len(judged))
             continue
+        method = accelerate(method, policy, device)
         label = {"method": name, "suites": rendered.name, "run": Path(outcome.get("run", name)).name}
         rows = [row for row in rows if row["method"] != name or row["run"] == label["run"]]
         for suite in judged:
@@ -129,7 +130,8 @@ def stress(
     write_rows(directory / ROWS, rows)
     if TRAINING in wanted:
         clean = suite_views.batches(CLEAN)["views", 0]
-        error = lambda method: float(np.mean([row["error"] for row in suite_views.rows(method, clean)[0]]))
+        rows_of = lambda method: suite_views.rows(accelerate(method, policy, device), clean)[0]
+        error = lambda method: float(np.mean([row["error"] for row in rows_of(method)]))
         train_suite(directory, comparison, content.content[TRAINING], runs, error, device)
     if _measured(directory) != before:  # otherwise keep the manifest of the run that measured them
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})

@@ -16,11 +16,11 @@ from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, read_points
 from nlt.errors import UserError
+from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
-from nlt.models.policy import Policy
 from nlt.models.transport import PointEmbedding
 from nlt.stress.inputs import BUDGET, FRAME
 from nlt.stress.rendering import DRAWS, ViewSet, read_views, view_sets
@@ -37,9 +37,8 @@ class SuiteViews:
         suites: Suites,
         wanted: list[str],
         device: torch.device,
-        policy: Policy,
     ) -> None:
-        self.directory, self.spec, self.suites, self.device, self.policy = directory, spec, suites, device, policy
+        self.directory, self.spec, self.suites, self.device = directory, spec, suites, device
         self.view_sets = view_sets(spec, suites, wanted)
         self.batches = cache(self._batches)
 
@@ -94,36 +93,36 @@ class SuiteViews:
         up, middle = (torch.tensor(v, device=self.device) for v in (description.up, description.camera.mean(0)))
         return FRAME[change](batch, value, up, middle)
 
-    @torch.inference_mode()
     def rows(self, method: Method, batches: list[Batch]) -> tuple[list[dict[str, Any]], np.ndarray]:
-        """Return a row per view, and the radiance (V, 3, H, W)."""
+        """Return a row per view, and the radiance (V, 3, H, W), 0 where it is not finite."""
         rows, images = [], []
-        for batch in batches:
-            prediction = self.predict(method, batch)
-            reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
-            bad = ~prediction.isfinite()
-            finite = prediction.masked_fill(bad, 0)
-            metrics = ImageMetrics(perceptual=False).to(self.device).update(finite, *reference)
-            columns = {"error": relative_error(finite, *reference), "nonfinite": bad.any(1).sum((1, 2))}
-            columns |= {name: metrics[name] for name in ("unbiased_mse", "mse", "mssim")}
+        metrics = ImageMetrics(perceptual=False).to(self.device)
+        for judged in evaluate(method, [self._with_traced(method, batch) for batch in batches], metrics):
+            batch = judged.batch
+            error = relative_error(judged.radiance, batch["reference_a"], batch["reference_b"], batch["exposure"])
+            columns = {"error": error, "nonfinite": judged.nonfinite}
+            columns |= {name: judged.metrics[name] for name in ("unbiased_mse", "mse", "mssim")}
             values = {name: column.tolist() for name, column in columns.items()}
             rows += [
                 {"scene": int(batch["scene"][k]), "view": k, **{name: column[k] for name, column in values.items()}}
-                for k in range(len(prediction))
+                for k in range(len(judged.radiance))
             ]
-            images.append(prediction.float().cpu().numpy())
+            images.append(judged.radiance.float().cpu().numpy())
         return rows, np.concatenate(images)
 
     def predict(self, method: Method, batch: Batch) -> Tensor:
-        """Return the radiance of a batch, computed as `nlt compare` does."""
+        """Return the radiance of a batch."""
+        return method(self._with_traced(method, batch))
+
+    def _with_traced(self, method: Method, batch: Batch) -> Batch:
+        """Return the batch with the path-traced input at the method's samples per pixel, if it reads one."""
         if "traced" in method.fields:
             name = f"traced_{method.spp}"
             if name not in batch:
                 place = f"{self.suites.file}: traced"
                 raise UserError(f"{place}: must contain {method.spp}, the samples per pixel of {type(method).__name__}")
             batch = batch | {"traced": batch[name]}
-        with self.policy.applied(self.device):
-            return method.to(self.device).eval()(batch)
+        return batch
 
     # --- flicker ---
 

@@ -39,7 +39,7 @@ from nlt.evaluation.results import load, write_images, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 from nlt.models.unet import UNet
 from nlt.paths import CONFIGS, PROJECT
 from nlt.report import learning_curves
@@ -228,12 +228,13 @@ def test_time_is_the_sum_of_the_stages_medians(world):
 
 
 def test_metrics_are_those_of_the_predictions(world):
-    module = RenderingModule.load_from_checkpoint(world.checkpoint("nlt_photons")).eval()
+    module = RenderingModule.load_from_checkpoint(world.checkpoint("nlt_photons"))
+    module = accelerate(module, Policy.for_device(CPU), CPU)
     dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test")
     mse, mssim = [], []
     for k in range(3):
         batch = default_collate([dataset[k]])
-        with torch.no_grad(), Policy.for_device(CPU).applied(CPU):
+        with torch.no_grad():
             prediction = module(batch)
         pair = [shown(x, batch) for x in (prediction, (batch["reference_a"] + batch["reference_b"]) / 2)]
         mse.append(np.mean((pair[0] - pair[1]) ** 2))

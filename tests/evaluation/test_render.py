@@ -23,7 +23,7 @@ from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.render import DEMO, ModelRenderer, _with_scene, render, write_video
 from nlt.metrics.display import display
 from nlt.models.nlt import NeuralLightTransport
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.trajectory import cameras, follow, states, turn
 
@@ -83,8 +83,9 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light, size):
     write_shard(tmp_path / points_name(0), [renderer.points()])
     write_shard(tmp_path / spec.shard("test", 0, 0).name, samples)
     batch = LightTransportDataset(tmp_path, spec, "test").__getitems__([0, 1, 2])
-    with torch.no_grad(), Policy.for_device(CPU).applied(CPU):
-        predicted = torch.cat([method({name: v[k : k + 1] for name, v in batch.items()}) for k in range(3)])
+    with torch.no_grad():
+        fast = accelerate(method, Policy.for_device(CPU), CPU)
+        predicted = torch.cat([fast({name: v[k : k + 1] for name, v in batch.items()}) for k in range(3)])
     exposure = renderer.description.exposure
     for k in range(3):
         expected = [255 * display(x[None], exposure)[0].permute(1, 2, 0) for x in (predicted[k], traced[k])]

@@ -3,12 +3,14 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from synthetic import POINTS, SCENES, synthetic_batch
 
+from nlt.baselines.cnn import CNN
 from nlt.evaluation.clock import _AliveMemory
-from nlt.models import policy
-from nlt.models.int8 import convolve
-from nlt.models.policy import Policy
-from nlt.models.unet import UNet
+from nlt.models import int8
+from nlt.models.int8 import Int8Conv2d, convolve, pack
+from nlt.models.nlt import NeuralLightTransport
+from nlt.models.policy import Policy, accelerate
 
 CPU = torch.device("cpu")
 
@@ -26,7 +28,7 @@ def test_error_is_that_of_rounding(channels, size):
     """At each pixel at most what half a step of each weight and one of each input can make, and bfloat16's own."""
     conv, x = made(channels, 8, size)
     with torch.no_grad():
-        found = convolve(conv, x, {}, relu=False)
+        found = convolve(conv, x, pack(conv))
     weight, exact = conv.weight.detach().double(), x.double()
     step_x, step_w = exact.amax() / 252, weight.abs().amax((1, 2, 3), keepdim=True) / 127
     expected = F.conv2d(exact, weight, conv.bias.detach().double(), padding=1)
@@ -38,14 +40,13 @@ def test_error_is_that_of_rounding(channels, size):
     assert found.dtype == torch.bfloat16 and found.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_positive_part_and_images_by_themselves():
+def test_an_image_does_not_depend_on_its_batch():
     conv, x = made(64, 6, (8, 8), images=3)
     x[1] *= 1000
-    packed = {}
+    packed = pack(conv)
     with torch.no_grad():
-        together, positive = (convolve(conv, x, packed, relu=relu) for relu in (False, True))
-        alone = [convolve(conv, image[None], packed, relu=False)[0] for image in x]
-    assert torch.equal(positive, together.relu()) and (together < 0).any() and len(packed) == 1
+        together = convolve(conv, x, packed)
+        alone = [convolve(conv, image[None], packed)[0] for image in x]
     assert all(torch.equal(a, b) for a, b in zip(together, alone, strict=True))
 
 
@@ -54,25 +55,29 @@ def test_nothing_and_no_number():
     conv, x = made(64, 6, (8, 8))
     with torch.no_grad():
         torch.testing.assert_close(
-            convolve(conv, x * 0, {}, False).float(), conv.bias.view(1, -1, 1, 1).expand(1, 6, 8, 8), rtol=2**-8, atol=0
+            convolve(conv, x * 0, pack(conv)).float(),
+            conv.bias.view(1, -1, 1, 1).expand(1, 6, 8, 8),
+            rtol=2**-8,
+            atol=0,
         )
         for wrong in (float("nan"), float("inf")):
             x[0, 3, 2, 2] = wrong
-            assert not convolve(conv, x, {}, False)[0, :, 2, 2].isfinite().any()
+            assert not convolve(conv, x, pack(conv))[0, :, 2, 2].isfinite().any()
 
 
-def test_the_policy_takes_large_ones_without_gradients(monkeypatch):
-    monkeypatch.setattr(policy, "_LEAST_PRODUCTS", 9 * 64 * 64 * 60)
+def test_accelerate_takes_large_ones(monkeypatch):
+    monkeypatch.setattr(int8, "_LEAST_PRODUCTS", 9 * 64 * 64 * 60)
     taken = []
-    original = policy.int8.convolve
-    monkeypatch.setattr(policy.int8, "convolve", lambda conv, *rest: taken.append(conv) or original(conv, *rest))
+    original = int8.convolve
+    monkeypatch.setattr(int8, "convolve", lambda conv, *rest: taken.append(conv) or original(conv, *rest))
     torch.manual_seed(0)
-    net, x = UNet(5, width=64, depth=1).eval(), torch.randn(2, 5, 8, 8)
+    method, batch = CNN(width=64, depth=1).eval(), synthetic_batch(size=8)
 
-    def run(how):
+    def run(policy):
         taken.clear()
-        with how.applied(CPU):
-            return net(x), [name for name, module in net.named_modules() if module in taken]
+        fast = accelerate(method, policy, CPU)
+        parts = {part: name for name, part in fast.unet.named_modules() if isinstance(part, torch.nn.Conv2d)}
+        return fast(batch), sorted({parts[conv].removesuffix(".conv") for conv in taken})
 
     with torch.no_grad():
         expected, none = run(Policy())
@@ -82,14 +87,26 @@ def test_the_policy_takes_large_ones_without_gradients(monkeypatch):
     assert names == ["down.0.conv_0", "down.0.conv_1", "down.1.conv_1", "up.0.conv_0", "up.0.conv_1"]
     assert not none and not rather_not
     assert (image.float() - expected).square().mean() < 0.02**2 * expected.square().mean()
-    assert not run(Policy(bfloat16=True, int8=True))[1]  # with gradients
+    assert not any(isinstance(part, Int8Conv2d) for part in method.modules())  # the method itself stays as it was
+
+
+def test_bfloat16_computes_what_autocast_does():
+    torch.manual_seed(0)
+    method, batch = (
+        NeuralLightTransport(photons=True, width=4, num_points=POINTS, num_scenes=SCENES).eval(),
+        synthetic_batch(),
+    )
+    with torch.no_grad():
+        with torch.autocast("cpu", torch.bfloat16):
+            expected = method(batch)
+        assert torch.equal(accelerate(method, Policy(bfloat16=True), CPU)(batch), expected)
 
 
 def test_memory_is_counted():
     """As the clock does; what oneDNN has packed has no storage that could be asked."""
     conv, x = made(64, 64, (16, 16))
     with torch.no_grad(), _AliveMemory() as memory:
-        y = convolve(conv, x, {}, relu=True)
+        y = convolve(conv, x, pack(conv))
     assert y.numel() * 2 + x.numel() <= memory.peak < 64 * (y.numel() + conv.weight.numel())
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlt.models import plain
+from nlt.bench import plain
 from nlt.models.projection import average_sparsely, project, visible_pixels
 
 H, W = 12, 16

@@ -7,72 +7,43 @@ optimizations of the usual path do not belong here.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
-from nlt.models.module import Batch, Features, RenderingModule
-from nlt.models.policy import Policy
+from nlt.models.module import RenderingModule
 from nlt.models.unet import UNet
 
 
 def plain(method: RenderingModule) -> RenderingModule:
     """Return a copy of a method that computes the same image, up to rounding, by the plain path."""
     twin = copy.deepcopy(method).float().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    twin.__class__ = type(f"Plain{type(method).__name__}", (_Plain, type(method)), {})
+    twin.unet, twin.projection = PlainUNet(twin.unet), project
     return twin
 
 
-class _Plain(RenderingModule):
-    """The methods that a plain copy overrides."""
+class PlainUNet(nn.Module):
+    """The U-Net as in the supplementary's figure, block by block: (B, C, H, W) to (B, 3 or 6, H, W)."""
 
-    def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
-        camera = (batch["camera_matrix"], batch["world_to_view"])
-        return project(features, positions, valid, *camera, batch["depth"], batch["normal"])
+    def __init__(self, net: UNet) -> None:
+        super().__init__()
+        self.net = net
 
-    def synthesize(self, batch: Batch, features: Features) -> Tensor:
-        assert isinstance(features, Tensor)
-        return self.to_radiance(batch, _unet(self.unet, features.contiguous()))
-
-    def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
-        return {name: _in_float32(step) for name, step in super().steps().items()}
-
-
-def _in_float32(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], Any]:
-    def run(batch: Batch, result: Any) -> Any:
-        with _float32(batch["exposure"].device):
-            return step(batch, result)
-
-    return run
-
-
-@contextmanager
-def _float32(device: torch.device) -> Iterator[None]:
-    """Disable the policy's fast paths and TF32."""
-    precision = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
-    try:
-        with Policy().applied(device), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
-            yield
-    finally:
-        torch.set_float32_matmul_precision(precision)
-
-
-def _unet(net: UNet, x: Tensor) -> Tensor:
-    """Run the U-Net as in the supplementary's figure, block by block: (B, C, H, W) to (B, 3 or 6, H, W)."""
-    levels = [_block(net.down[0], net.conv_in(x))]
-    for block in net.down[1:]:
-        levels.append(_block(block, F.max_pool2d(levels[-1], 2, ceil_mode=True)))
-    x = levels.pop()
-    for block in net.up:
-        skip = levels.pop()
-        upsampled = F.interpolate(x, skip.shape[-2:], mode="bilinear", align_corners=False)
-        x = _block(block, torch.cat([upsampled, skip], dim=1))
-    return net.conv_out(F.relu(x))
+    def forward(self, x: Tensor, sparse: object = ()) -> Tensor:
+        """Run the U-Net without TF32; there are no sparse maps."""
+        net = self.net
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            levels = [_block(net.down[0], net.conv_in(x.contiguous()))]
+            for block in net.down[1:]:
+                levels.append(_block(block, F.max_pool2d(levels[-1], 2, ceil_mode=True)))
+            x = levels.pop()
+            for block in net.up:
+                skip = levels.pop()
+                upsampled = F.interpolate(x, skip.shape[-2:], mode="bilinear", align_corners=False)
+                x = _block(block, torch.cat([upsampled, skip], dim=1))
+            return net.conv_out(F.relu(x))
 
 
 def _block(block: Any, x: Tensor) -> Tensor:
