@@ -12,7 +12,6 @@ from typing import Any
 from zipfile import is_zipfile
 
 import lightning as L
-import torch
 from jsonargparse import ArgumentError
 from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -23,6 +22,7 @@ from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.errors import UserError
 from nlt.metrics.display import display
+from nlt.models.factory import read_checkpoint
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
@@ -228,28 +228,6 @@ def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:
             *callbacks,
         ],
     }
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Load a checkpoint without running code from it; a file that is not one can raise any exception."""
-    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    return dict(checkpoint)
-
-
-def load_method(path: str, place: str, device: torch.device | str = "cpu") -> RenderingModule:
-    """Load the method of a checkpoint; `place`, for example an option, begins the error messages.
-
-    Raises:
-        UserError: the file cannot be read or is not a checkpoint.
-    """
-    try:
-        return RenderingModule.load_from_checkpoint(path, map_location=device)
-    except OSError as error:
-        raise UserError(f"{place}: {path}: cannot be read: {error.strerror}") from None
-    except UserError:
-        raise
-    except Exception:  # a damaged file can make the unpickler raise anything
-        raise UserError(f"{place}: {path}: not a checkpoint, or damaged; give another one") from None
 
 
 def newest_checkpoint(run: Path) -> Path | None:

@@ -17,8 +17,9 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.render import DEMO
+from nlt.models.factory import read_checkpoint
 from nlt.models.policy import default_device
-from nlt.training import read_checkpoint, run_lightning
+from nlt.training import run_lightning
 
 CONFIGS = [f"configs/{name}.yaml" for name in ("data/demo", "model/photon_splat", "scale/pretrained")]
 

@@ -8,16 +8,17 @@ import torch
 from torch import Tensor
 
 from nlt.errors import UserError
-from nlt.models.module import PROJECTION, Batch, RenderingModule, join
+from nlt.models.clouds import CloudMethod
+from nlt.models.module import PROJECTION, Batch, join
 from nlt.models.transport import PointEmbedding
 
 INPUTS = ("position", "point_features", "normal", "ray_direction")
 
 
-class InputAblation(RenderingModule):
+class InputAblation(CloudMethod):
     """Sec. "Ablation Study on Static Scene": the U-Net on any combination of inputs, without light transport."""
 
-    architecture = (*RenderingModule.architecture, "num_scenes", "num_points", *INPUTS, "embedding")
+    architecture = (*CloudMethod.architecture, "num_scenes", "num_points", *INPUTS, "embedding")
     stages = ("gbuffer",)
 
     def __init__(

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule
+from nlt.models.clouds import CloudMethod
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features
 from nlt.models.transport import PointEmbedding
 
 
-class FeatureProjection(RenderingModule):
+class FeatureProjection(CloudMethod):
     """Sec. "Baselines" (3), similar to Aliev et al. 2019: G-buffer and projected point embeddings."""
 
-    architecture = (*RenderingModule.architecture, "num_scenes", "num_points", "embedding")
+    architecture = (*CloudMethod.architecture, "num_scenes", "num_points", "embedding")
     inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "point_position", "point_visible")))
     stages = ("gbuffer",)
 

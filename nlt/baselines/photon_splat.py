@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, RenderingModule, join, log_exposed
+from nlt.models.clouds import CloudMethod
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, join, log_exposed
 from nlt.models.projection import total, visible_pixels
 
 _RADII = (1, 2, 4, 8)  # of footprints, in pixels from the middle one
@@ -28,10 +29,10 @@ def seen_area(batch: Batch) -> Tensor:
     return (batch["depth"].square() * along / (focal * cosine)).abs()
 
 
-class PhotonSplat(RenderingModule):
+class PhotonSplat(CloudMethod):
     """The U-Net on the G-buffer and the log of the irradiance, a photon density estimate (Jensen 1996)."""
 
-    architecture = (*RenderingModule.architecture, "footprint")
+    architecture = (*CloudMethod.architecture, "footprint")
     inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "photon_flux", "photon_hit", "photon_valid")))
     stages = ("gbuffer", "photons")
     feature_channels = GBUFFER_CHANNELS + 3

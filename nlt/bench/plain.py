@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from nlt.models.clouds import CloudMethod
 from nlt.models.module import RenderingModule
 from nlt.models.unet import UNet
 
@@ -20,7 +21,9 @@ from nlt.models.unet import UNet
 def plain(method: RenderingModule) -> RenderingModule:
     """Return a copy of a method that computes the same image, up to rounding, by the plain path."""
     twin = copy.deepcopy(method).float().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    twin.unet, twin.projection = PlainUNet(twin.unet), project
+    twin.unet = PlainUNet(twin.unet)
+    if isinstance(twin, CloudMethod):
+        twin.projection = project
     return twin
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import pydoc
 import shutil
 import statistics
 import sys
@@ -41,12 +40,13 @@ from nlt.evaluation.frames import Frames
 from nlt.evaluation.paper import order
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.metrics.quantities import NETWORK_STAGES
+from nlt.models.factory import build, load_method, method_class
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
-from nlt.training import load_method, quiet, trainer_defaults
+from nlt.training import quiet, trainer_defaults
 
 # The settings of the dataset, the model and the training, and the number of frames rendered at once.
 _DATASET, _MODEL, _DATA = ("resolution", "points", "photons"), ("width", "depth"), ("batch_size", "workers")
@@ -264,25 +264,20 @@ class _Bench:
 
     def method(self, name: str, settings: Mapping[str, int]) -> Method:
         """Return a method with random weights or the checkpoint's."""
-        if method := build_if_untrained(name):
-            return method
         if self.checkpoint:
             return self._loaded(name)
         file = find_config("model", name)
         config = read_configs([self.files[0], str(file), self.files[1]])
         torch.manual_seed(0)
         arguments = {key: settings[key] for key in _MODEL} | {"num_scenes": len(self.spec.scenes)}
-        kind: Any = pydoc.locate(str(config["model"].get("class_path")))
-        try:
-            return kind(**{**config["model"].get("init_args", {}), **arguments, "num_points": settings["points"]})
-        except TypeError as error:
-            raise UserError(f"{file}: model: {error}") from None
+        return build(config, file, **arguments, num_points=settings["points"])
 
     def _loaded(self, name: str) -> RenderingModule:
         method = load_method(str(self.checkpoint), "--ckpt", self.device)
-        wanted = read_configs([str(find_config("model", name))])["model"]["class_path"]
-        if method.class_path() != wanted:
-            raise UserError(f"--ckpt: {self.checkpoint}: is of {method.class_path()}, not {wanted}; give its method")
+        file = find_config("model", name)
+        wanted = method_class(read_configs([file]), file)
+        if type(method) is not wanted:
+            raise UserError(f"--ckpt: {self.checkpoint}: is of {type(method).__name__}, not {wanted.__name__}")
         points = self.settings["points"]
         points = min(points, method.hparams["max_points"] or points)
         for key, here in (("num_points", points), ("num_scenes", len(self.spec.scenes))):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pydoc
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from nlt.config import read_configs
 from nlt.data.spec import check_keys
 from nlt.errors import UserError
 from nlt.evaluation.paper import order, tables
+from nlt.models.factory import build, method_class
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
@@ -108,11 +108,5 @@ def build_if_untrained(method: str) -> Method | None:
         UserError: its init_args do not fit the class.
     """
     file = find_config("model", method.partition("@")[0])
-    model = read_configs([str(file)]).get("model", {})
-    kind = pydoc.locate(str(model.get("class_path")))
-    if not (isinstance(kind, type) and issubclass(kind, Method)) or issubclass(kind, RenderingModule):
-        return None  # a class path that names no class is reported by the training
-    try:
-        return kind(**model.get("init_args", {}))
-    except TypeError as error:
-        raise UserError(f"{file}: model.init_args: {error}") from None
+    config = read_configs([file])
+    return None if issubclass(method_class(config, file), RenderingModule) else build(config, file)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import pydoc
 from pathlib import Path
 
 import torch
@@ -19,9 +18,9 @@ from nlt.data.files import write_bytes
 from nlt.data.sample import BATCH_FIELDS, FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
+from nlt.models.factory import build, load_method, read_checkpoint
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
-from nlt.training import load_method, read_checkpoint
 
 SAFETENSORS = ".safetensors"
 
@@ -51,7 +50,7 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
         save_trained(*load_trained(checkpoint), output)
         return
     method = load_method(checkpoint, "CKPT")
-    sizes: dict[str, int] = {"H": resolution, "W": resolution, "P": photons, "N": method.hparams["num_points"]}
+    sizes: dict[str, int] = {"H": resolution, "W": resolution, "P": photons, "N": method.hparams.get("num_points", 1)}
     fields = {name: (FIELDS | BATCH_FIELDS)[name] for name in (*method.fields, "exposure", "scene", "index")}
     batch, described = {}, {}
     for name, field in fields.items():
@@ -103,14 +102,13 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
         with safe_open(path, "pt") as file:
             metadata = json.loads(file.metadata()["nlt"])
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        kind = pydoc.locate(metadata["method"])
-        assert isinstance(kind, type) and issubclass(kind, RenderingModule)
-        method = kind(**metadata["init_args"])
-        method.load_state_dict(weights)
-        return method, DatasetSpec(**metadata["dataset"]), metadata.get("points", [])
+        loaded = build({"model": {"class_path": metadata["method"], "init_args": metadata["init_args"]}}, "CKPT")
+        assert isinstance(loaded, RenderingModule)
+        loaded.load_state_dict(weights)
+        return loaded, DatasetSpec(**metadata["dataset"]), metadata.get("points", [])
     except OSError as error:
         raise UserError(f"CKPT: {path}: cannot be read: {error.strerror or error}") from None
-    except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, AssertionError):
+    except (SafetensorError, LookupError, TypeError, UserError, ValueError, RuntimeError, AssertionError):
         raise UserError(
             f"CKPT: {path}: damaged, or not written by nlt export -o NAME{SAFETENSORS}; export it again"
         ) from None

@@ -6,12 +6,13 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 import yaml
 
@@ -31,6 +32,8 @@ from nlt.training import check_configs, newest_checkpoint, run_lightning
 class Training:
     """A job: a method's training with a seed, on all training images or the first `train_images` of each scene.
 
+    `changes` is a config in JSON that overrides the `files`.
+
     The name of its directory `run` has a hash of all that determines the outcome, so a method is trained again only
     when that changes. The directory holds checkpoints, log, progress and, after the end, the outcome.
     """
@@ -41,16 +44,23 @@ class Training:
     files: tuple[str, ...]
     precision: str
     train_images: int | None = None
+    changes: str = "{}"
 
     @classmethod
     def of(
-        cls, comparison: Comparison, method: str, seed: int, root: Path, train_images: int | None = None
+        cls,
+        comparison: Comparison,
+        method: str,
+        seed: int,
+        root: Path,
+        train_images: int | None = None,
+        changes: Mapping[str, Any] | None = None,
     ) -> Training:
         """Create a comparison's training, with a directory below `root`."""
-        files = comparison.configs(method)
-        merged = read_configs(files)
+        files, changes = comparison.configs(method), changes or {}
         if train_images:
-            merged = merge(merged, {"data": {"train_images": train_images}})
+            changes = merge(changes, {"data": {"train_images": train_images}})
+        merged = merge(read_configs(files), changes)
         # A method that was trained on another device, in that device's precision, is not trained again on this one.
         choices = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
         precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in choices)
@@ -58,7 +68,7 @@ class Training:
         precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
         # Absolute, because processes on other machines have other working directories.
         paths = tuple(os.path.abspath(file) for file in files)
-        return cls(method, seed, runs[precision].absolute(), paths, precision, train_images)
+        return cls(method, seed, runs[precision].absolute(), paths, precision, train_images, json.dumps(changes))
 
     @property
     def name(self) -> str:
@@ -161,39 +171,40 @@ def _config_hash(config: dict[str, Any], seed: int, precision: str) -> str:
 
 
 def _fit(training: Training, progress: Progress) -> dict[str, Any]:
-    """Train, from the newest checkpoint if there is one, and return the facts about the training."""
-    run_config = training.run / "run.yaml"
-    run_config.write_text(yaml.safe_dump(_run_config(training)))
-    arguments = ["fit", *(f"--config={file}" for file in (*training.files, run_config))]
-    checkpoint = newest_checkpoint(training.run)
-    if checkpoint:
-        print(f"resuming from {checkpoint}", flush=True)
-        arguments.append(f"--ckpt_path={checkpoint}")
-    trainer = run_lightning(arguments, [progress]).trainer
+    """Run a job's training and return the facts about it."""
+    config = merge(read_configs(training.files), json.loads(training.changes))
+    # Set here, because another machine might choose another precision than the one in the directory's hash.
+    config = merge({"trainer": {"precision": training.precision}}, config)
+    resumed = newest_checkpoint(training.run) is not None
+    trainer = fit(training.run, config, training.seed, [progress])
     return {
         "train_s": progress.seconds,
         "steps": trainer.global_step,
         "images_seen": images_seen(trainer),
         "trained_at_commit": origin()["commit"],
-        "resumed": checkpoint is not None,
+        "resumed": resumed,
     }
 
 
-def _run_config(training: Training) -> dict[str, Any]:
+def fit(run: Path, config: Mapping[str, Any], seed: int, callbacks: Sequence[L.Callback] = ()) -> L.Trainer:
+    """Train with a seed in the directory `run`, from its newest checkpoint if there is one."""
     # nlt/report/dashboard.py logs hyperparameters, once the metrics are known.
-    logger = {"save_dir": str(training.run), "name": "", "version": "", "default_hp_metric": False}
-    trainer = read_configs(list(training.files)).get("trainer") or {}
-    return {
-        "seed_everything": training.seed,
-        "model": {"init_args": {"seed": training.seed}},
-        "data": {"seed": training.seed} | ({"train_images": training.train_images} if training.train_images else {}),
+    logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
+    own = {
+        "seed_everything": seed,
+        "model": {"init_args": {"seed": seed}},
+        "data": {"seed": seed},
         "trainer": {
-            # Set here, because another machine might choose another precision than the one in the directory's hash.
-            "precision": trainer.get("precision", training.precision),
-            # Jobs run in parallel instead; Lightning's processes for more devices would run the whole command.
-            "devices": trainer.get("devices", 1),
             "enable_model_summary": False,
             "enable_progress_bar": False,
             "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
         },
     }
+    # Jobs run in parallel instead; Lightning's processes for more devices would run the whole command.
+    config = merge(merge({"trainer": {"devices": 1}}, config), own)
+    write_bytes(run / "run.yaml", yaml.safe_dump(config).encode())
+    arguments = ["fit", f"--config={run / 'run.yaml'}"]
+    if checkpoint := newest_checkpoint(run):
+        print(f"resuming from {checkpoint}", flush=True)
+        arguments.append(f"--ckpt_path={checkpoint}")
+    return run_lightning(arguments, callbacks).trainer

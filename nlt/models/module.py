@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import lightning as L
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
 
@@ -19,8 +19,7 @@ from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
 from nlt.models.method import Batch, Method
-from nlt.models.projection import SparseMap, average_sparsely, project, visible_pixels
-from nlt.models.transport import PointEmbedding
+from nlt.models.projection import SparseMap
 from nlt.models.unet import UNet
 
 # Batch fields that the G-buffer input and the projection read.
@@ -31,12 +30,8 @@ GBUFFER_CHANNELS = 10
 
 _WARM_UP = 0.05  # share of the steps, with lr_schedule "cosine"
 
-Cloud = tuple[Tensor, Tensor, Tensor]  # features (B, N, C), positions (B, N, 3), validity (B, N)
 Steps = dict[str, Callable[[Batch, Any], Any]]
 Features = Tensor | tuple[Tensor, list[SparseMap]]
-
-# Values of these hyperparameters in checkpoints that were written before they could be chosen.
-_FIXED = {"points": True, "point_width": 64, "photon_width": 64, "output": "radiance", "add_emission": True}
 
 
 def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
@@ -54,6 +49,13 @@ def warm_up_and_cosine(step: int, steps: int) -> float:
     if step < warm_up:
         return (step + 1) / warm_up
     return (1 + math.cos(math.pi * (step - warm_up) / max(1, steps - warm_up))) / 2
+
+
+def check_at_least(least: int, **values: int | None) -> None:
+    """Raise UserError if a hyperparameter is below `least`; None means that it is not set."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
 
 
 def join(maps: Sequence[Tensor]) -> Tensor:
@@ -74,27 +76,18 @@ class RenderingModule(Method, L.LightningModule):
     architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission")
     # Fast paths at inference, which `nlt.models.policy.accelerate` switches on; see `Policy`.
     sparse = in_bfloat16 = False
-    projection: Callable[..., Tensor] = staticmethod(project)
 
     def __init__(
         self,
         width: int = 64,
         depth: int = 3,
-        point_width: int = 64,
-        photon_width: int = 64,
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
         loss: Literal["mse", "relative_mse"] = "mse",
         learning_rate: float = 5e-4,
         lr_schedule: Literal["paper", "cosine"] = "paper",
         lr_decay: float = 0.99,
-        embedding_lr: float = 1.0,
-        embedding_decay: float = 0.0,
         clip_share: float = 1.0,
-        num_scenes: int = 1,
-        num_points: int = 1,
-        max_points: int | None = None,
-        max_photons: int | None = None,
         seed: int = 0,
     ) -> None:
         """The defaults are the paper's.
@@ -102,8 +95,6 @@ class RenderingModule(Method, L.LightningModule):
         Args:
             width: feature maps of the U-Net's first level.
             depth: number of times the U-Net halves the resolution.
-            point_width: number of features of a point, even; used by methods with a PointNet.
-            photon_width: number of features of a photon; used by methods with a photon network.
             output: how the U-Net's channels become an image. "radiance" is the paper's: three channels are the image.
                 "demodulated": albedo times the first three channels, plus the last three. A method without the albedo
                 as input predicts radiance either way.
@@ -114,29 +105,15 @@ class RenderingModule(Method, L.LightningModule):
             lr_schedule: "paper" multiplies the rate by `lr_decay` after each epoch. "cosine" changes it at every step:
                 a linear warm-up over the first 5 % of the steps, then half a cosine down to zero.
             lr_decay: factor on the learning rate after each epoch, with the schedule "paper".
-            embedding_lr: factor on the learning rate of the point embeddings.
-            embedding_decay: decoupled weight decay (Loshchilov and Hutter 2019) of the point embeddings.
             clip_share: share of the steps, from the first on, in which the trainer's gradient_clip_val applies.
-            num_scenes: scenes in the dataset; linked from the data.
-            num_points: points per scene; linked from the data.
-            max_points: number of points that are used; None for all.
-            max_photons: number of a sample's photons that are used, with their total flux kept; None for all.
             seed: seed of the random numbers that a method draws in training.
         """
         super().__init__()
-        transport = (("point_width", point_width, 2), ("photon_width", photon_width, 1))
-        for name, value, least in (("width", width, 1), ("depth", depth, 0), *transport):
-            if value < least:
-                raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
+        check_at_least(1, width=width)
+        check_at_least(0, depth=depth)
         if not 0 <= clip_share <= 1:
             raise UserError(f"model.init_args.clip_share: must be between 0 and 1, is {clip_share}")
-        for name, most in (("max_points", max_points), ("max_photons", max_photons)):
-            if most is not None and most < 1:
-                raise UserError(f"model.init_args.{name}: must be at least 1, is {most}")
-        if point_width % 2:
-            raise UserError(f"model.init_args.point_width: must be even, is {point_width}")
         self.save_hyperparameters()
-        self.hparams["num_points"] = min(num_points, max_points or num_points)  # the number of embeddings per scene
         self.loss = getattr(losses, loss)
         # channels_last is the fastest layout of the convolutions.
         unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)
@@ -144,6 +121,8 @@ class RenderingModule(Method, L.LightningModule):
         self._metrics: list[ImageMetrics] = []  # in a list, which keeps them out of the parameters and the checkpoint
 
     # --- what a method defines ---
+
+    has_point_embeddings = False  # whether the method learns embeddings, valid for the training scenes' points only
 
     @property
     def feature_channels(self) -> int:
@@ -181,24 +160,6 @@ class RenderingModule(Method, L.LightningModule):
         """Return depth, normal, albedo and view direction (B, 10, H, W)."""
         return join([batch[name] for name in GBUFFER])
 
-    def project(self, batch: Batch, features: Tensor, positions: Tensor, valid: Tensor) -> Tensor:
-        """Project features (B, N, C) at positions (B, N, 3) to (B, C, H, W) by Eq. (1), with the batch's camera."""
-        camera = (batch["camera_matrix"], batch["world_to_view"])
-        return self.projection(features, positions, valid, *camera, batch["depth"], batch["normal"])
-
-    def gbuffer_and(self, batch: Batch, clouds: Sequence[Cloud], maps: Sequence[Tensor] = ()) -> Features:
-        """Return the G-buffer followed by one map per cloud; one mean over all would mix their kinds of feature.
-
-        `maps` are appended; they exist only while gradients are wanted, and then no map is sparse.
-        """
-        gbuffer = self.gbuffer(batch)
-        # With more points than pixels, dense maps are faster (docs/performance.md).
-        if self.sparse and gbuffer[0, 0].numel() >= max((len(valid[0]) for *_, valid in clouds), default=0):
-            view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
-            projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
-            return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]
-        return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds), *maps])
-
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""
         dense, sparse = (features, []) if isinstance(features, Tensor) else features
@@ -217,27 +178,6 @@ class RenderingModule(Method, L.LightningModule):
         scale, offset = channels.split(3, dim=1)
         radiance = expose(batch["albedo"] * scale + offset, 1 / batch["exposure"])
         return radiance + batch["emission"] if self.hparams["add_emission"] else radiance
-
-    @property
-    def has_point_embeddings(self) -> bool:
-        """Whether the method learns embeddings, which are valid for the training scenes' points only."""
-        return any(isinstance(part, PointEmbedding) for part in self.modules())
-
-    @property
-    def num_photons(self) -> int | None:
-        return self.hparams["max_photons"]
-
-    def subsample(self, batch: Batch) -> Batch:
-        """Return the batch with at most `max_points` points and `max_photons` photons, whose total flux is kept."""
-        points, photons = self.hparams["max_points"], self.hparams["max_photons"]
-        if points:  # they are in random order, so the first ones are a uniform sample
-            batch = {k: v[:, :points] if k.startswith("point_") else v for k, v in batch.items()}
-        total = batch["photon_flux"].shape[1] if "photon_flux" in batch else 0
-        if photons and total > photons:  # they are sorted by emitter; equal strides keep each one's share
-            chosen = ((torch.arange(photons, device=batch["photon_flux"].device) + 0.5) * (total / photons)).long()
-            batch = {k: v[:, chosen] if k.startswith("photon_") else v for k, v in batch.items()}
-            batch["photon_flux"] = batch["photon_flux"] * (total / photons)
-        return batch
 
     def steps(self) -> Steps:
         """Return the steps "transport", "projection" and "synthesis"."""
@@ -259,23 +199,19 @@ class RenderingModule(Method, L.LightningModule):
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch["scene"]))
         return loss
 
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Return Adam's parameter groups: one, unless some parameters have options of their own."""
+        return [{"params": list(self.parameters())}]
+
     def configure_optimizers(self) -> Any:
         chosen = self.hparams
-        rate, embeddings = chosen["learning_rate"], self._embeddings()
-        embedding_ids = {id(parameter) for parameter in embeddings}
-        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if id(p) not in embedding_ids]}]
-        if embeddings:
-            options = {"lr": rate * chosen["embedding_lr"], "weight_decay": chosen["embedding_decay"]}
-            groups.append({"params": embeddings, **options})
+        groups, rate = self.parameter_groups(), chosen["learning_rate"]
         optimizer = torch.optim.Adam(groups, lr=rate, decoupled_weight_decay=True, fused=True)
         if chosen["lr_schedule"] == "paper":
             return [optimizer], [ExponentialLR(optimizer, gamma=chosen["lr_decay"])]
         steps = int(self.trainer.estimated_stepping_batches)
         schedule = LambdaLR(optimizer, lambda step: warm_up_and_cosine(step, steps))
         return [optimizer], [{"scheduler": schedule, "interval": "step"}]
-
-    def _embeddings(self) -> list[nn.Parameter]:
-        return [p for part in self.modules() if isinstance(part, PointEmbedding) for p in part.parameters()]
 
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: Any = None, gradient_clip_algorithm: Any = None
@@ -340,7 +276,7 @@ class RenderingModule(Method, L.LightningModule):
         path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
-        saved = _FIXED | checkpoint["architecture"]
+        saved = checkpoint["architecture"]
         different = [name for name in self.architecture if saved[name] != self.hparams[name]]
         if different:
             raise UserError(

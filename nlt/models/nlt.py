@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.data.sample import MATERIALS
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, RenderingModule, log_exposed
+from nlt.models.clouds import CloudMethod
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, log_exposed
 from nlt.models.projection import average_rows, visible_pixels
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
@@ -17,11 +18,11 @@ POINT_ATTRIBUTES = 3 + len(MATERIALS) + 3 + 3 + 1  # position, material, albedo,
 PHOTON_ATTRIBUTES = 3 + 3 + 3  # origin, direction, colour
 
 
-class NeuralLightTransport(RenderingModule):
+class NeuralLightTransport(CloudMethod):
     """Sec. "Method": the U-Net sees the G-buffer, projected point features and, with `photons`, photon features."""
 
     architecture = (
-        *RenderingModule.architecture, "num_scenes", "num_points", "points", "photons", "embedding",
+        *CloudMethod.architecture, "num_scenes", "num_points", "points", "photons", "embedding",
         "point_width", "photon_width",
     )  # fmt: skip
 

@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from torch.utils.data import DataLoader
 
-from nlt import training
 from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError
 from nlt.evaluation.evaluate import evaluate
+from nlt.evaluation.trainings import fit
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
+from nlt.models.factory import read_checkpoint
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, accelerate
 from nlt.select.space import Candidate, SearchSpace
-from nlt.training import newest_checkpoint, read_checkpoint
+from nlt.training import newest_checkpoint
 
 SCORES = ("unbiased_mse", "mssim")  # where they disagree, the first one decides
 _BATCH = 16
@@ -69,24 +69,11 @@ class Trials:
 
     def _fit(self, run: Path, candidate: Candidate, seed: int, steps: int) -> int:
         """Train up to `steps` and return how many of them were done now."""
-        logger = {"save_dir": str(run), "name": "", "version": "", "default_hp_metric": False}
-        own = {
-            "seed_everything": seed,
-            "model": {"init_args": {"seed": seed}},
-            "data": {"seed": seed},
-            "trainer": {
-                "max_steps": steps, "limit_val_batches": 0, "enable_progress_bar": False, "enable_model_summary": False,
-                "logger": {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": logger},
-            },
-        }  # fmt: skip
-        file = run / "run.yaml"
-        write_bytes(file, yaml.safe_dump(merge(self.space.config(candidate), own)).encode())
-        arguments, before = ["fit", f"--config={file}"], 0
-        if checkpoint := newest_checkpoint(run):
-            before = read_checkpoint(checkpoint)["global_step"]
-            arguments.append(f"--ckpt_path={checkpoint}")
+        checkpoint = newest_checkpoint(run)
+        before = read_checkpoint(checkpoint)["global_step"] if checkpoint else 0
         if before < steps:
-            training.run_lightning(arguments)
+            limits = {"trainer": {"max_steps": steps, "limit_val_batches": 0}}
+            fit(run, merge(self.space.config(candidate), limits), seed)
         return steps - before
 
     def score(self, candidate: Candidate, seed: int, split: str) -> Scores:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-import yaml
 
 from nlt.config import merge, read_configs
 from nlt.data.engines import available_cpus
-from nlt.data.files import write_bytes
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
@@ -38,16 +35,6 @@ class Corruption(L.Callback):
             batch["noisy"][k].view(3, -1)[:, k % self.one_in :: self.one_in] *= self.factor
 
 
-@dataclass
-class _Varied(Comparison):
-    """A comparison with one more config that overrides each method's own."""
-
-    over: Path | None = None
-
-    def configs(self, method: str) -> list[str]:
-        return [*super().configs(method), str(self.over)]
-
-
 def train_suite(
     directory: Path,
     comparison: Comparison,
@@ -65,11 +52,8 @@ def train_suite(
     jobs: list[tuple[dict[str, Any], Training]] = []
     for method in _one_per_kind(comparison):
         config = read_configs(comparison.configs(method))
-        for variation, value, seed, over in _variations(config, content, comparison):
-            file = runs / STRESS / f"{method}-{variation}-{value}.yaml".replace(" ", "_").replace("/", "_")
-            write_bytes(file, yaml.safe_dump(over).encode())
-            own = {field.name: getattr(comparison, field.name) for field in fields(Comparison)}
-            training = Training.of(_Varied(**own, over=file), method, seed, runs / STRESS)
+        for variation, value, seed, changes in _variations(config, content, comparison):
+            training = Training.of(comparison, method, seed, runs / STRESS, changes=changes)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
     # Networks this small leave a second core idle; an accelerator runs one training at a time.
     failures = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
