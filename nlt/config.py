@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from nlt import paths
 from nlt.errors import UserError
 
 T = TypeVar("T")
@@ -25,23 +27,43 @@ class Settings(BaseModel):
 
 
 def read_configs(files: Sequence[str | Path]) -> dict[str, Any]:
-    """Merge YAML configs; later files override earlier ones.
+    """Merge YAML configs, given by path or by name, for example "data/demo"; later ones override earlier ones.
+
+    A config with the key `base` overrides the config of that name in its own folder.
 
     Raises:
         UserError: a file is missing or is not YAML.
     """
-    merged: dict[str, Any] = {}
-    for file in files:
-        try:
-            data = yaml.safe_load(Path(file).read_text()) or {}
-        except OSError as error:
-            raise UserError(f"{file}: cannot be read: {error.strerror}") from None
-        except yaml.YAMLError as error:
-            raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
-        if not isinstance(data, Mapping):
-            raise UserError(f"{file}: must be a mapping, is a {type(data).__name__}")
-        merged = merge(merged, data)
-    return merged
+    return reduce(merge, (_read(paths.find_config("", file)) for file in files), {})
+
+
+def _read(file: Path, above: Sequence[Path] = ()) -> dict[str, Any]:
+    """Return the content of a config, merged with its base; `above` are the configs that build on it."""
+    try:
+        content = yaml.safe_load(file.read_text()) or {}
+    except FileNotFoundError:
+        raise UserError(f"{file}: No such file{_known_files(file)}") from None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read: {error.strerror}") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, Mapping):
+        raise UserError(f"{file}: must be a mapping, is a {type(content).__name__}")
+    if "base" not in content:
+        return dict(content)
+    base = file.with_name(f"{content['base']}.yaml")
+    if base in (file, *above):
+        raise UserError(f"{file}: base: {content['base']} builds on this config; name another one")
+    return merge(_read(base, (file, *above)), {key: value for key, value in content.items() if key != "base"})
+
+
+def _known_files(missing: Path) -> str:
+    """Return the names that are known where a config is missing; nothing outside the project's configs."""
+    if paths.CONFIGS not in missing.parents:
+        return ""
+    folder = missing.parent if missing.parent.is_dir() else paths.CONFIGS
+    names = sorted(f"{entry.name}/NAME" if entry.is_dir() else entry.stem for entry in folder.iterdir())
+    return f"; known are {', '.join(names)}"
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,9 +20,19 @@ def cache_root() -> Path:
     ).expanduser()
 
 
-def find_config(kind: str, name: str) -> Path:
-    """Return the file of a config, given by name (`configs/<kind>/<name>.yaml`; may contain folders) or by path."""
-    return Path(name) if name.endswith((".yaml", ".yml")) else CONFIGS / kind / f"{name}.yaml"
+def find_config(kind: str, name: str | Path) -> Path:
+    """Return the file of a config, which need not exist; the config is given by its path or by its name.
+
+    The name may contain or omit `configs/`, the kind and `.yaml`. If the kind is "", the name must contain it, for
+    example "data/demo".
+    """
+    path = Path(name)
+    is_file_name = path.suffix in (".yaml", ".yml")
+    if path.is_absolute() or (path.suffix and path.is_file()):
+        return path
+    short = (path.with_suffix("") if is_file_name else path).as_posix().removeprefix("configs/")
+    named = CONFIGS / kind / f"{short.removeprefix(f'{kind}/')}.yaml"
+    return path if is_file_name and not named.is_file() else named
 
 
 def config_names(kind: str) -> list[str]:

@@ -6,12 +6,13 @@ import argparse
 import logging
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
 
 import lightning as L
+import yaml
 from jsonargparse import ArgumentError
 from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -40,6 +41,8 @@ _NOISE = (
 )
 # Names of checkpoints that Lightning finds by itself.
 _LIGHTNING_CHECKPOINTS = ("best", "last", "hpc")
+# A setting as `key=value`, without the dashes of Lightning's `--key=value`.
+_SETTING = re.compile(r"(data|model|trainer|seed_everything|ckpt_path)\b[\w.+]*=")
 
 
 class Checkpoints(ModelCheckpoint):
@@ -137,27 +140,23 @@ def check_configs(files: list[str]) -> None:
     Raises:
         UserError: a key is unknown or a value has the wrong type.
     """
-    arguments = ["fit", *(f"--config={file}" for file in files)]
-    _run(_ConfigChecker, arguments[1:], _sources(arguments), run=False)
+    _run(_ConfigChecker, ["fit", *(f"--config={file}" for file in files)], run=False)
 
 
 def run_lightning(arguments: list[str], callbacks: Sequence[L.Callback] = ()) -> NLTCLI:
-    """Run a subcommand, for example `fit --config ...`, and return its LightningCLI.
+    """Run a subcommand, for example `fit --config data/demo ...`, and return its LightningCLI.
+
+    Settings are given as `--key=value`, `--key value` or `key=value`; they override all configs.
 
     Raises:
         UserError: a config, a checkpoint or the dataset is wrong.
     """
-    return _run(NLTCLI, arguments, _sources(arguments), callbacks)
+    return _run(NLTCLI, arguments, callbacks)
 
 
-def _run(
-    kind: type[NLTCLI],
-    arguments: list[str],
-    sources: dict[str, str],
-    callbacks: Sequence[L.Callback] = (),
-    run: bool = True,
-) -> NLTCLI:
+def _run(kind: type[NLTCLI], arguments: list[str], callbacks: Sequence[L.Callback] = (), run: bool = True) -> NLTCLI:
     quiet()
+    command, configs, settings = arguments[0], *_parse(arguments[1:])
     try:
         return kind(
             RenderingModule,
@@ -168,32 +167,37 @@ def _run(
             trainer_defaults=trainer_defaults(callbacks),
             save_config_kwargs={"overwrite": True},
             parser_kwargs={"exit_on_error": False},
-            args=arguments,
+            args=[command] * run + _merged(configs, settings) + settings,
             run=run,
         )
     except ArgumentError as error:
-        raise UserError(_with_source(str(error), sources, arguments[0] if run else "fit")) from None
+        sources = {file: yaml.safe_dump(read_configs([file])) for file in configs}
+        sources |= {setting: setting for setting in settings}
+        raise UserError(_with_source(str(error), sources, command)) from None
     except UserError as error:  # an error from a loader process contains its traceback
         raise type(error)(str(error).rpartition("UserError: ")[2].strip()) from None
 
 
-def _sources(arguments: list[str]) -> dict[str, str]:
-    """Return the text of every source of settings: the --config files and the other arguments.
-
-    Raises:
-        UserError: a file cannot be read, or has settings of a model that no config has chosen yet.
-    """
+def _parse(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Return the configs and the other arguments, in which `key=value` has become `--key=value`."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-c", "--config", action="append", nargs="?", default=[])
-    options, rest = parser.parse_known_args(arguments[1:])
-    files = [file for file in options.config if file]
-    known = any(argument.startswith("--model") for argument in rest)
-    for file in files:
-        model = read_configs([file]).get("model")
-        known = known or (isinstance(model, Mapping) and "class_path" in model)
-        if model and not known:
-            raise UserError(f"{file}: model.class_path: missing; give a --config from configs/model before this one")
-    return {file: Path(file).read_text() for file in files} | {argument: argument for argument in rest}
+    options, others = parser.parse_known_args(arguments)
+    settings = [f"--{word}" if _SETTING.match(word) else word for word in others]
+    return [file for file in options.config if file], settings + ["--config"] * (None in options.config)
+
+
+def _merged(configs: list[str], settings: list[str]) -> list[str]:
+    """Return the configs as one argument, so that their order is free where they do not override each other.
+
+    Raises:
+        UserError: a file cannot be read, or there are settings of a model that none of the configs chooses.
+    """
+    content = read_configs(configs)
+    model = content.get("model")
+    if model and "class_path" not in model and not any(setting.startswith("--model") for setting in settings):
+        raise UserError(f"{' + '.join(configs)}: model.class_path: missing; add a --config from configs/model")
+    return [f"--config={yaml.safe_dump(content)}"] if configs else []
 
 
 def _one_line(message: str) -> str:

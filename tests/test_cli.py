@@ -192,6 +192,19 @@ def test_unknown_comparison(refused):
     refused(["compare", "--config=nope"], "compare/nope.yaml", "No such file")
 
 
+def test_order_of_configs_and_spelling_of_settings_are_free(tiny, tmp_path, capsys):
+    def printed(*arguments):
+        with pytest.raises(SystemExit):
+            main(["fit", *arguments, "--print_config"])
+        return yaml.safe_load(capsys.readouterr().out)
+
+    files = [f"--config={tiny.scale}", "--config=model/cnn", f"--config={tiny.data}"]
+    config = printed(*files, "model.init_args.width=4")
+    assert config["model"]["class_path"] == "nlt.baselines.cnn.CNN" and config["model"]["init_args"]["width"] == 4
+    for setting in (["--model.init_args.width=4"], ["--model.init_args.width", "4"]):
+        assert printed(*setting, *reversed(files)) == config
+
+
 # ---- scenes, datasets -----------------------------------------------------------------------------------
 
 
