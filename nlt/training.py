@@ -6,7 +6,7 @@ import argparse
 import logging
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -23,7 +23,7 @@ from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.errors import UserError
 from nlt.metrics.display import display
-from nlt.models.factory import read_checkpoint
+from nlt.models.factory import method_class, read_checkpoint, without_unused
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
@@ -193,10 +193,12 @@ def _merged(configs: list[str], settings: list[str]) -> list[str]:
     Raises:
         UserError: a file cannot be read, or there are settings of a model that none of the configs chooses.
     """
-    content = read_configs(configs)
+    content, place = read_configs(configs), " + ".join(configs)
     model = content.get("model")
-    if model and "class_path" not in model and not any(setting.startswith("--model") for setting in settings):
-        raise UserError(f"{' + '.join(configs)}: model.class_path: missing; add a --config from configs/model")
+    if isinstance(model, Mapping) and "class_path" in model:
+        content = without_unused(content, method_class(content, place))
+    elif model and not any(setting.startswith("--model") for setting in settings):
+        raise UserError(f"{place}: model.class_path: missing; add a --config from configs/model")
     return [f"--config={yaml.safe_dump(content)}"] if configs else []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pydoc
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Any
 
 import torch
 
+from nlt.config import merge
 from nlt.errors import UserError
+from nlt.models.clouds import CloudMethod
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 
@@ -27,6 +30,19 @@ def method_class(config: Mapping[str, Any], place: object) -> type[Method]:
     return kind
 
 
+def without_unused(config: Mapping[str, Any], kind: type[Method] | None) -> dict[str, Any]:
+    """Return a config without the settings of points and photons if a method of this class uses neither.
+
+    Configs of a scale or variant are for all methods alike.
+    """
+    if kind is None or issubclass(kind, CloudMethod):
+        return dict(config)
+    unused = set(inspect.signature(CloudMethod).parameters) - set(inspect.signature(RenderingModule).parameters)
+    model = dict(config.get("model", {}))
+    model["init_args"] = {key: value for key, value in model.get("init_args", {}).items() if key not in unused}
+    return {**config, "model": model}
+
+
 def build(config: Mapping[str, Any], place: object, **sizes: Any) -> Method:
     """Return a config's method with random weights; `sizes` override the init_args of a trained method.
 
@@ -34,9 +50,9 @@ def build(config: Mapping[str, Any], place: object, **sizes: Any) -> Method:
         UserError: the config names no method, or its init_args do not fit.
     """
     kind = method_class(config, place)
-    arguments = {**config["model"].get("init_args", {}), **(sizes if issubclass(kind, RenderingModule) else {})}
+    sized = merge(config, {"model": {"init_args": sizes if issubclass(kind, RenderingModule) else {}}})
     try:
-        return kind(**arguments)
+        return kind(**without_unused(sized, kind)["model"]["init_args"])
     except TypeError as error:
         raise UserError(f"{place}: model.init_args: {error}") from None
 

@@ -122,7 +122,10 @@ class RenderingModule(Method, L.LightningModule):
 
     # --- what a method defines ---
 
-    has_point_embeddings = False  # whether the method learns embeddings, valid for the training scenes' points only
+    @property
+    def has_point_embeddings(self) -> bool:
+        """Whether the method learns embeddings, which are valid for the training scenes' points only."""
+        return False
 
     @property
     def feature_channels(self) -> int:
