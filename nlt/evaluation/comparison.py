@@ -2,19 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from nlt.config import read_configs
-from nlt.data.spec import check_keys
-from nlt.errors import UserError
+from pydantic import NonNegativeInt, field_validator
+
+from nlt.config import Settings, parse, read_configs
 from nlt.evaluation.paper import order, tables
 from nlt.models.factory import build, method_class
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
 
-_KEYS = ("table", "data", "scale", "variant", "methods", "seed")
+
+class _Content(Settings):
+    """The content of a config of configs/compare."""
+
+    table: str | None = None
+    data: str
+    scale: str
+    variant: str | None = None
+    methods: list[str] | None = None
+    seed: NonNegativeInt = 0
+
+    @field_validator("table")
+    @classmethod
+    def _known_table(cls, table: str | None) -> str | None:
+        return _known("table", table, tables())
+
+    @field_validator("variant")
+    @classmethod
+    def _known_variant(cls, variant: str | None) -> str | None:
+        return _known("variant", variant, config_names("variant"))
+
+    @field_validator("methods")
+    @classmethod
+    def _known_methods(cls, methods: list[str] | None) -> list[str] | None:
+        for method in methods or ():
+            name, *variants = method.split("@", 1)
+            _known("method", name, config_names("model"))
+            for variant in variants:
+                _known("variant", variant, config_names("variant"))
+        return methods
+
+
+def _known(kind: str, name: str | None, names: Collection[str]) -> str | None:
+    if name is not None and name not in names:
+        raise ValueError(f"no {kind} {name!r}; known are {', '.join(names)}")
+    return name
 
 
 @dataclass
@@ -50,43 +86,20 @@ class Comparison:
             UserError: an unknown key, table, method or file.
         """
         file = find_config("compare", config)
-        content = read_configs([str(file)])
-        check_keys(f"{file}: ", content, _KEYS)
-        names = [file.stem]
-        for key, value in (("scale", scale), ("data", data)):
-            if value and value != content.get(key):
-                names.append(find_config(key, value).stem if Path(value).suffix else value.replace("/", "-"))
-            content[key] = value or content.get(key)
-            if not isinstance(content[key], str):
-                raise UserError(f"{file}: {key}: missing; name a config of configs/{key}")
-        table, seed = content.get("table"), content.get("seed", 0)
-        if table is not None and table not in tables():
-            raise UserError(f"{file}: table: must be one of {', '.join(tables())}, is {table!r}")
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise UserError(f"{file}: seed: must be an integer of at least 0, is {seed!r}")
-        variants = config_names("variant")
-        shared = content.get("variant")
-        if shared is not None and shared not in variants:
-            raise UserError(f"{file}: variant: no variant {shared!r} in configs/variant; known: {', '.join(variants)}")
-        known = sorted(config_names("model"), key=order)
+        own = read_configs([file])
+        changes = {"scale": scale, "data": data, "methods": methods}
+        content = parse(_Content, own | {key: value for key, value in changes.items() if value}, file)
+        changed = [(key, value) for key, value in changes.items() if isinstance(value, str) and value != own.get(key)]
         # Methods in subfolders take part only where a comparison names them.
-        chosen = methods or content.get("methods") or [name for name in known if "/" not in name]
-        for method in chosen:
-            name, _, variant = method.partition("@")
-            if name not in known:
-                raise UserError(f"{file}: methods: no method {name!r} in configs/model; known: {', '.join(known)}")
-            if "@" in method and variant not in variants:
-                raise UserError(
-                    f"{file}: methods: no variant {variant!r} in configs/variant; known: {', '.join(variants)}"
-                )
+        chosen = content.methods or [name for name in config_names("model") if "/" not in name]
         return cls(
-            name="-".join(names),
-            data=find_config("data", content["data"]),
-            scale=find_config("scale", content["scale"]),
-            variant=find_config("variant", shared) if shared else None,
-            table=table,
+            name="-".join([file.stem, *(find_config(key, value).stem for key, value in changed)]),
+            data=find_config("data", content.data),
+            scale=find_config("scale", content.scale),
+            variant=find_config("variant", content.variant) if content.variant else None,
+            table=content.table,
             methods=sorted(chosen, key=order),
-            seeds=list(range(seed, seed + seeds)),
+            seeds=list(range(content.seed, content.seed + seeds)),
             precision=precision,
         )
 
