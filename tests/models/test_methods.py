@@ -11,7 +11,6 @@ from pathlib import Path
 import lightning as L
 import pytest
 import torch
-from jsonargparse import ArgumentParser
 from lightning.pytorch.loggers import TensorBoardLogger
 from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
 from torch.utils.data import DataLoader
@@ -23,9 +22,11 @@ from nlt.baselines.feature_projection import FeatureProjection
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.bench.plain import plain
 from nlt.cli import main
+from nlt.config import read_configs
 from nlt.errors import UserError
 from nlt.evaluation.comparison import build_if_untrained
-from nlt.models import losses
+from nlt.models import factory, losses
+from nlt.models.clouds import CloudMethod
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import GBUFFER, RenderingModule
 from nlt.models.moving_camera import MovingCamera
@@ -41,14 +42,8 @@ SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 
 
 def build(config: Path, scale: Path | None = None, more: dict[str, int] = SIZE) -> RenderingModule:
-    """As the command line does: the model's file, then overrides without class_path."""
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--config", action="config")
-    parser.add_subclass_arguments(RenderingModule, "model")
-    files = [f"--config={path}" for path in (config, scale) if path]
-    overrides = [f"--model.init_args.{name}={value}" for name, value in more.items()]
     torch.manual_seed(0)
-    return parser.instantiate_classes(parser.parse_args([*files, *overrides])).model
+    return factory.build(read_configs([path for path in (config, scale) if path]), config, **more)
 
 
 @pytest.fixture(params=CONFIGS, ids=lambda path: path.stem)
@@ -284,16 +279,6 @@ def test_checkpoint_loads_with_weights_only(checkpoints):
         assert restored.eval()(batch).isfinite().all()
 
 
-def test_checkpoint_from_before_widths_could_be_chosen(tmp_path, checkpoints):
-    checkpoint, batch = torch.load(checkpoints["nlt_photons"], weights_only=True), synthetic_batch()
-    for name in ("points", "point_width", "photon_width"):
-        del checkpoint["architecture"][name], checkpoint["hyper_parameters"][name]
-    torch.save(checkpoint, tmp_path / "old.ckpt")
-    paths = (tmp_path / "old.ckpt", checkpoints["nlt_photons"])
-    old, new = (RenderingModule.load_from_checkpoint(path).eval() for path in paths)
-    assert torch.equal(old(batch), new(batch))
-
-
 @pytest.mark.parametrize(
     ("wanted", "options", "saved", "message"),
     [
@@ -325,7 +310,8 @@ def test_checkpoint_from_before_widths_could_be_chosen(tmp_path, checkpoints):
 )
 def test_checkpoint_of_another_method(tmp_path, checkpoints, wanted, options, saved, message):
     """One line, whether a trainer resumes or tests or the class loads."""
-    model, data = wanted(**{**SIZE, **options}), loader(synthetic_batch())
+    size = SIZE if issubclass(wanted, CloudMethod) else {"width": SIZE["width"]}
+    model, data = wanted(**{**size, **options}), loader(synthetic_batch())
     run = trainer(tmp_path, max_epochs=2)
     for load in (
         lambda: run.fit(model, data, ckpt_path=checkpoints[saved], weights_only=True),
