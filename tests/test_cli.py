@@ -179,7 +179,7 @@ def test_scale_without_a_model(refused, tiny):
         ({"methods": ["cnn@nope"]}, ["comparison.yaml", "methods", "nope", "tiny", "paper"]),
         ({"scale": "nope"}, ["nope.yaml", "No such file"]),
         ({"data": "nope"}, ["nope.yaml", "No such file"]),
-        ({"scale": None}, ["comparison.yaml", "scale", "configs/scale"]),
+        ({"scale": None}, ["comparison.yaml", "scale", "must be a text"]),
         ({"seed": -1}, ["comparison.yaml", "seed", "-1"]),
     ],
 )
