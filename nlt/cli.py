@@ -64,7 +64,9 @@ def _run(arguments: list[str]) -> int:
     if arguments and arguments[0] in _LIGHTNING:
         from nlt.training import run_lightning
 
-        run_lightning(arguments)
+        trainer = run_lightning(arguments).trainer
+        if arguments[0] == "fit":
+            print(f"written to {trainer.log_dir}")
         return 0
     options = _parser().parse_args(arguments)
     if options.command in _FRAMES:
@@ -95,12 +97,12 @@ def _run(arguments: list[str]) -> int:
 
         selection = (options.methods, options.suites, options.manifest, options.views)
         stress(options.config, options.out, options.scale, options.data, *selection)
-    elif options.command == "report":
+    elif options.command == "report" and options.dashboard is None:
         _draw(options.directory, options.megabytes)
-    elif options.command == "dashboard":
+    elif options.command == "report":
         from nlt.report.dashboard import dashboard
 
-        dashboard(options.directory, options.port)
+        dashboard(options.directory, options.dashboard)
     elif options.command == "scenes":
         _scenes(options)
     elif options.command == "teachers":
@@ -198,13 +200,14 @@ def _scenes(options: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="nlt", description="Learned light transport: find the best renderer for a scene and a time budget.",
-        epilog="`nlt compare --config demo` runs everything in minutes; docs/commands.md describes all commands.",
+        epilog="`nlt compare --config demo` runs everything in minutes. Datasets are written to datasets, trainings to "
+        "runs and results to results, all in the current directory. docs/commands.md describes all commands.",
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"nlt {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     generate = commands.add_parser("generate", help="render a dataset, or its missing files")
     generate.add_argument(
-        "--config", action="append", required=True, help="YAML file; later files override earlier ones"
+        "--config", action="append", required=True, help="config by name, for example data/demo, or path; repeatable"
     )
     _add_scheduler(generate, "concurrent jobs (default: available CPUs; on Dask, its threads; in a Slurm array, 64)")
     data = commands.add_parser("data", help="show, verify or measure a dataset")
@@ -216,7 +219,7 @@ def _parser() -> argparse.ArgumentParser:
     stress = commands.add_parser("stress", help="find where a comparison's methods fail, at increasing severity")
     for command in (compare, stress):
         command.add_argument("--config", required=True, help="comparison in configs/compare, by name or path")
-        command.add_argument("--out", help="directory for the results (default: results/NAME or NAME-SCALE-DATA)")
+        command.add_argument("--out", help="directory for the results (default: results/NAME or NAME_SCALE_DATA)")
         command.add_argument("--scale", help="config in configs/scale, by name or path (default: the comparison's)")
         command.add_argument("--data", help="config in configs/data, by name or path (default: the comparison's)")
         command.add_argument("--methods", nargs="+", help="configs in configs/model (default: the comparison's or all)")
@@ -254,12 +257,13 @@ def _parser() -> argparse.ArgumentParser:
     select.add_argument(
         "--advice", action="store_true", help="report what varies in the scene and what a model needs; train nothing"
     )
-    report = commands.add_parser("report", help="redraw the tables, figures and report.html of results")
+    report = commands.add_parser("report", help="redraw a comparison's tables, figures and report.html, or show them")
+    report.add_argument("directory", help="results directory of nlt compare")
     report.add_argument("--megabytes", type=_positive, help="maximum size of report.html (default: 25)")
-    board = commands.add_parser("dashboard", help="show a comparison's training runs and results in TensorBoard")
-    board.add_argument("--port", type=_whole, default=6006, help="server port (default: 6006; 0 takes a free port)")
-    for command in (report, board):
-        command.add_argument("directory", help="results directory of nlt compare")
+    report.add_argument(
+        "--dashboard", nargs="?", type=_whole, const=6006, metavar="PORT",
+        help="show the training runs and results in TensorBoard instead (default port: 6006; 0 takes a free one)",
+    )  # fmt: skip
     teachers = commands.add_parser("teachers", help="compare the integrators path and bdpt: variance at equal time")
     _add_views(teachers, seconds=(60, "seconds of rendering per integrator"), resolution=(64, _SIDE), views=(4, _VIEWS))
     teachers.add_argument("--out", type=Path, default=Path("results/teachers"), help=_OUT.format("results/teachers"))
@@ -282,18 +286,13 @@ def _add_views(parser: argparse.ArgumentParser, **numbers: tuple[int, str]) -> N
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
     parser.add_argument("--workers", type=_positive, help=workers)
     parser.add_argument(
-        "--scheduler",
-        default="local",
+        "--scheduler", default="local",
         help="local, slurm or a Dask scheduler, for example tcp://host:8786 (default: local)",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--slurm",
-        action="append",
-        type=_pair,
-        default=[],
-        metavar="KEY=VALUE",
+        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE",
         help="option of sbatch, for example time=60",
-    )
+    )  # fmt: skip
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:

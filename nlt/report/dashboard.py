@@ -1,4 +1,4 @@
-"""`nlt dashboard DIR`: a comparison in TensorBoard, with a run per method and seed.
+"""`nlt report DIR --dashboard`: a comparison in TensorBoard, with a run per method and seed.
 
 The log directory DIR/tensorboard is rebuilt from the results; curves and image grids are links to the trainings' own
 logs, where these still exist. No histograms are logged.

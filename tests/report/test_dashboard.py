@@ -1,4 +1,4 @@
-"""`nlt dashboard`: what TensorBoard itself says it shows."""
+"""`nlt report --dashboard`: what TensorBoard itself says it shows."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def stored(tmp_path_factory):
 def test_tensorboard_shows_it(stored):
     """A run per method and seed with its training's curves; the layout; hyperparameters; the chart; no histograms."""
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-    command = [sys.executable, "-c", "from nlt.cli import main; main()", "dashboard", str(stored), "--port=0"]
+    command = [sys.executable, "-c", "from nlt.cli import main; main()", "report", str(stored), "--dashboard=0"]
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which the background jobs of a shell ignore
     server = subprocess.Popen(
         command, cwd=stored.parent, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=heed
@@ -87,5 +87,5 @@ def test_again(stored, monkeypatch):
 
 
 def test_no_results(tmp_path, capsys):
-    assert main(["dashboard", str(tmp_path)]) == 2
+    assert main(["report", str(tmp_path), "--dashboard"]) == 2
     assert "nlt compare" in capsys.readouterr().err
