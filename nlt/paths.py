@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
-# An installed package contains its own copy of the configs.
-CONFIGS = next(folder for folder in (PROJECT / "configs", Path(__file__).with_name("configs")) if folder.is_dir())
+# The build copies the configs into the package.
+CONFIGS = next(folder for folder in (Path(__file__).with_name("configs"), PROJECT / "configs") if folder.is_dir())
 
 
 def scenes_root() -> Path:
