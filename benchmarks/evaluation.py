@@ -3,7 +3,7 @@
     python benchmarks/evaluation.py                          # nine methods, 4 x 64 views at 64x64, all metrics
     python benchmarks/evaluation.py --methods cnn nlt --views 64     # a part, extrapolated to the whole
 
-Writes results/benchmarks/evaluation.json. Weights and samples are random, which does not change the computation. The
+Writes results/bench/evaluation.json. Weights and samples are random, which does not change the computation. The
 cache of reference features starts empty; `references_cached_s` is the time of the first method when it is evaluated
 again with the cache on disk filled, as in a later run. A stage's seconds are those of its calls; "rest" is the time
 outside all stages.
@@ -112,10 +112,10 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=256)
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--width", type=int, default=16)
-    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/evaluation.json"))
+    parser.add_argument("--out", type=Path, default=Path("results/bench/evaluation.json"))
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    scenes = load_spec([str(find_config("data", "dynamic_fixed_lights"))])[0].scenes
+    scenes = load_spec([str(find_config("data", "builtin_fixed_lights"))])[0].scenes
     if options.views % len(scenes):
         parser.error(f"--views: must be a multiple of Table 1's {len(scenes)} scenes, is {options.views}")
     test = options.views // len(scenes)

@@ -1,6 +1,6 @@
 """Compares the speed of generation with a bare loop of `mi.render` that traces the same rays on this machine.
 
-    python benchmarks/generation.py                  # writes results/benchmarks/generation.json and .md
+    python benchmarks/generation.py                  # writes results/bench/generation.json and .md
 
 For every sample, both move the objects (`Scene.set_state`, which is Mitsuba's own `params.update`) and render a
 path-traced image at 1 spp, another at 4 spp and, for evaluated samples, two at 64 spp. They trace one ray per pixel for
@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("--shard", type=int, default=16, help="samples in a turn")
     parser.add_argument("--end-to-end", type=int, default=512, help="training samples of the whole command")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=PROJECT / "results" / "benchmarks")
+    parser.add_argument("--out", type=Path, default=PROJECT / "results" / "bench")
     options = parser.parse_args()
     manifest = origin() | {"command": shlex.join(["python", "benchmarks/generation.py", *sys.argv[1:]])}
     count = options.shard * (options.rounds + 1)

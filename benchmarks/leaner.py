@@ -1,9 +1,9 @@
 """Finds how small a model may be, and how much of the learned 3D network a scene needs.
 
     python benchmarks/leaner.py --seeds 3
-    python benchmarks/leaner.py --judge results/leaner results/photon_splat/bedroom
+    python benchmarks/leaner.py --judge results/sizes results/photon_splat_bedroom
 
-Runs `nlt compare` for five network sizes (results/leaner), and for photon splats in three settings and with three
+Runs `nlt compare` for five network sizes (results/sizes), and for photon splats in three settings and with three
 photon counts (results/photon_splat); a stopped run resumes. Then writes leanest.md to each directory from the stored
 results alone (`--judge` does only this): the cheapest method that is worse than the best by no more than seed noise.
 """
@@ -27,12 +27,12 @@ from nlt.evaluation.results import LEVEL, Results, load
 from nlt.metrics.quantities import METRICS
 
 STUDIES = {  # directory of the results: arguments of nlt compare
-    "results/photon_splat/living_room": "--config photon_splat",
-    "results/photon_splat/bedroom": "--config photon_splat --data leaner/bedroom",
-    "results/photon_splat/living_room_fixed_lights": "--config photon_splat --data demo_fixed_lights",
-    "results/photon_splat/photon_counts": "--config photon_splat --methods nlt_photons photon_splat "
+    "results/photon_splat_living_room": "--config photon_splat",
+    "results/photon_splat_bedroom": "--config photon_splat --data builtin_bedroom_moving_lights",
+    "results/photon_splat_living_room_fixed_lights": "--config photon_splat --data demo_fixed_lights",
+    "results/photon_counts": "--config photon_splat --methods nlt_photons photon_splat "
     "nlt_photons@photons_1000 photon_splat@photons_1000 nlt_photons@photons_100 photon_splat@photons_100",
-    "results/leaner": "--config leaner",
+    "results/sizes": "--config sizes",
 }
 KEYS = ("mse", "mssim")
 

@@ -1,6 +1,6 @@
 """Compares the speed of training's data loading with only reading the same bytes and their CRC on this machine.
 
-    python benchmarks/loading.py                     # writes results/benchmarks/loading.json
+    python benchmarks/loading.py                     # writes results/bench/loading.json
 
 A dataset of random bytes in the format of nlt/data/sample.py is written to a temporary folder and read from the page
 cache. The loader is the DataModule's own, with its shuffling, its processes and its CRCs, and its batches arrive in
@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from torch.utils.data import DataLoader, Dataset
 
+from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.sample import MATERIALS, POINT_FIELDS, Field
@@ -69,7 +69,7 @@ def synthetic(spec: DatasetSpec, root: str) -> Path:
 
 def build(method: str, spec: DatasetSpec, width: int) -> Method:
     """Return a method with random weights."""
-    model: Any = yaml.safe_load(find_config("model", method).read_text())["model"]
+    model: Any = read_configs([find_config("model", method)])["model"]
     kind: Any = pydoc.locate(model["class_path"])
     more = {"width": width, "num_scenes": len(spec.scenes), "num_points": spec.points}
     return kind(**model.get("init_args", {}), **(more if issubclass(kind, RenderingModule) else {}))
@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/loading.json"))
+    parser.add_argument("--out", type=Path, default=Path("results/bench/loading.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     spec = DatasetSpec(["living_room"], resolution=options.resolution, train=options.samples, val=0, test=0)

@@ -1,6 +1,6 @@
 """Measures the time of Open Image Denoise in each of its modes, on random images, which do not change the times.
 
-Usage: python benchmarks/oidn.py                              # writes results/benchmarks/oidn.json and oidn.md
+Usage: python benchmarks/oidn.py                              # writes results/bench/oidn.json and oidn.md
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WARM_UP, TIMED, ROUNDS = 3, 10, 4
 def main() -> None:
     """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=PROJECT / "results/benchmarks")
+    parser.add_argument("--out", type=Path, default=PROJECT / "results/bench")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     record = {**origin(), **surroundings(device), "load_average": {"before": os.getloadavg()}}

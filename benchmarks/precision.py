@@ -1,7 +1,7 @@
 """Measures what bfloat16 and 8-bit integers cost in accuracy: trained methods on their test views, in three precisions.
 
-    python benchmarks/precision.py                           # writes results/benchmarks/precision.json
-    python benchmarks/precision.py --config table2 --methods cnn --seeds 3
+    python benchmarks/precision.py                           # writes results/bench/precision.json
+    python benchmarks/precision.py --config table2_real --methods cnn --seeds 3
 
 Uses the trainings of `nlt compare --config CONFIG --seeds SEEDS`; a method without a training is left out, which is
 printed. A policy's figure is relative to float32's on the same weights and views: 0.001 is a tenth of a percent.
@@ -43,10 +43,10 @@ def judge(method: RenderingModule, dataset: LightTransportDataset, policy: Polic
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="leaner")
+    parser.add_argument("--config", default="sizes")
     parser.add_argument("--methods", nargs="+", default=["nlt_photons@paper", "cnn@paper", "nlt_photons@large"])
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/precision.json"))
+    parser.add_argument("--out", type=Path, default=Path("results/bench/precision.json"))
     options = parser.parse_args()
     comparison = Comparison.load(options.config, None, None, options.methods, options.seeds)
     spec, root = load_spec([str(comparison.data), str(comparison.scale)])

@@ -1,6 +1,6 @@
 """Measures the size of report.html and the precision of its images, at the images' own size and at twice that.
 
-    python benchmarks/report_size.py results/demo          # writes results/benchmarks/report_size.json
+    python benchmarks/report_size.py results/demo          # writes results/bench/report_size.json
 
 Twice the size: every image becomes four images, of four views, in a square. A real rendering at twice the resolution is
 smoother from pixel to pixel, so it compresses better.
@@ -29,7 +29,7 @@ def main() -> None:
     """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("directory", type=Path)
-    parser.add_argument("--out", type=Path, default=PROJECT / "results/benchmarks/report_size.json")
+    parser.add_argument("--out", type=Path, default=PROJECT / "results/bench/report_size.json")
     options = parser.parse_args()
     results = load(options.directory).manifest
     record = {**origin(), **surroundings(torch.device("cpu"))}

@@ -27,7 +27,7 @@ def _rates(bench: Path) -> tuple[dict, dict, dict, dict]:
 def tables(bench: Path) -> str:
     """Return the measured rates and the cost of the paper's Table 2 at these rates, as Markdown."""
     manifest, generation, training, frame = _rates(bench)
-    files = [str(find_config("data", "dynamic_moving_lights")), str(find_config("scale", "paper"))]
+    files = [str(find_config("data", "builtin_moving_lights")), str(find_config("scale", "paper"))]
     (spec, _), scale = load_spec(files), read_configs(files)
     scenes, judged, cores = len(spec.scenes), spec.val + spec.test, manifest["threads"]
     images = scale["trainer"]["max_steps"] * scale["data"]["batch_size"]

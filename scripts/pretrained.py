@@ -1,8 +1,8 @@
 """Make the model of `nlt render --demo` from a finished training: safetensors, and a manifest of its origin.
 
-    nlt generate --config configs/data/demo.yaml --config configs/scale/pretrained.yaml
-    nlt fit --config configs/data/demo.yaml --config configs/model/photon_splat.yaml \
-        --config configs/scale/pretrained.yaml --trainer.default_root_dir runs/pretrained
+    nlt generate --config data/demo --config scale/pretrained
+    nlt fit --config data/demo --config model/photon_splat \
+        --config scale/pretrained --trainer.default_root_dir runs/pretrained
     python scripts/pretrained.py runs/pretrained/lightning_logs/version_0/checkpoints/*.ckpt $(git rev-parse HEAD)
 """
 
@@ -21,7 +21,7 @@ from nlt.models.factory import read_checkpoint
 from nlt.models.policy import default_device
 from nlt.training import run_lightning
 
-CONFIGS = [f"configs/{name}.yaml" for name in ("data/demo", "model/photon_splat", "scale/pretrained")]
+CONFIGS = ("data/demo", "model/photon_splat", "scale/pretrained")
 
 
 def main(checkpoint: str, commit: str) -> None:

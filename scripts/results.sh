@@ -12,24 +12,21 @@ once() {
 publish() {
     once nlt compare --scale "$scale" --workers "${WORKERS:-2}" "$@"
 }
-publish --config table2 --seeds 3
-publish --config table1 --seeds 3
-publish --config ablation --seeds 3
-publish --config ablation --data real/static_egg
-publish --config static_kitchen
-publish --config static_bathroom
-publish --config static_kitchen --data static_kitchen
-publish --config static_bathroom --data static_bathroom
-publish --config table2 --data dynamic_moving_lights --seeds 3
-publish --config table1 --data dynamic_fixed_lights --seeds 3
-once nlt stress --config table2 --scale "$scale" --views 1
+for comparison in table2_real table1_real ablation table2_builtin table1_builtin; do
+    publish --config "$comparison" --seeds 3
+done
+for comparison in ablation_real static_kitchen_real static_bathroom_real static_kitchen_builtin static_bathroom_builtin; do
+    publish --config "$comparison"
+done
+once nlt stress --config table2_real --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
     once nlt compare --config diagnosis
-    once nlt compare --config diagnosis --scale leaner_128 --methods path_tracing_1 denoising_1_1 denoising_1_16 \
-        denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
-    once nlt compare --config diagnosis --scale leaner_3200 --methods cnn feature_projection nlt nlt_photons
+    once nlt compare --config diagnosis --scale short_resolution_128 \
+        --methods path_tracing_1 denoising_1_1 denoising_1_16 denoising_1_32 denoising_1_64 \
+        cnn feature_projection nlt nlt_photons
+    once nlt compare --config diagnosis --scale short_images_3200 --methods cnn feature_projection nlt nlt_photons
 fi
 for report in results/*/report.html; do  # small enough for git
     case $report in results/table*) megabytes=8 ;; *) megabytes=4 ;; esac

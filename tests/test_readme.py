@@ -45,9 +45,9 @@ RUN = {
     "nlt scenes check room/scene.xml": "",
     "nlt scenes add room/scene.xml --name room": "",
     "nlt scenes preview room -o room.png": "--views 1 --resolution 16 --spp 1",
-    "nlt generate --config configs/data/room.yaml --config configs/scale/demo.yaml": "--config small.yaml --workers 1",
-    "nlt fit --config configs/data/demo.yaml --config configs/model/normals_only.yaml "
-    "--config configs/scale/demo.yaml": "--config configs/data/room.yaml --config small.yaml --config small_fit.yaml",
+    "nlt generate --config data/room --config scale/demo": "--config small.yaml --workers 1",
+    "nlt fit --config data/demo --config model/normals_only "
+    "--config scale/demo": "--config data/room --config small.yaml --config small_fit.yaml",
 }
 # Too long: parsed here to the end, and run for real, small, by these tests.
 ELSEWHERE = {
@@ -136,7 +136,7 @@ def parse(command):
         assert SearchSpace.load(options.config, options.minutes).methods
     elif name == "bench":
         assert load_spec([str(find_config("data", options.data)), str(find_config("scale", options.scale))])
-    elif name in ("report", "dashboard"):
+    elif name == "report":
         assert (PROJECT / options.directory / "manifest.json").exists()
     for scene in set(scenes) - {"room"}:
         load_description(scene, need_source=False)
@@ -214,6 +214,6 @@ def test_recipe_of_a_metric(monkeypatch):
 
 def test_provenance():
     """The manifest of the README's table says where it comes from."""
-    record = json.loads((PROJECT / "results/table2/manifest.json").read_text())
+    record = json.loads((PROJECT / "results/table2_real/manifest.json").read_text())
     assert record["command"].startswith("nlt compare") and len(record["commit"]) == 40
     assert record["n_test"] >= 64 and record["seeds"][0] == 0 and record["device"] and record["versions"]["torch"]

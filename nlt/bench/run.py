@@ -35,7 +35,7 @@ from nlt.data.stats import laps, timed_spp
 from nlt.data.store import missing_files, write_manifest, write_shard
 from nlt.errors import UserError
 from nlt.evaluation.clock import LEAST_FRAMES, Clock, summary
-from nlt.evaluation.comparison import build_if_untrained
+from nlt.evaluation.comparison import all_methods, build_if_untrained
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.paper import order
 from nlt.evaluation.provenance import origin, surroundings
@@ -101,7 +101,7 @@ def bench(
         out: the directory of the results.
         data: a config in configs/data, by name or path.
         scale: a config in configs/scale.
-        methods: configs in configs/model; None for all outside subfolders.
+        methods: configs in configs/model; None for all except the ablation's.
         changed: settings, out of `SETTINGS`, that override the configs'.
         checkpoint: weights of the only method; None for random weights.
         device: cpu or cuda; None for cuda where there is one.
@@ -166,7 +166,7 @@ class _Bench:
         self.config = read_configs(self.files)
         self.spec, _ = load_spec(self.files)
         known = config_names("model")
-        self.methods = sorted(methods or [name for name in known if "/" not in name], key=order)
+        self.methods = sorted(methods or all_methods(), key=order)
         for option, names in (("--methods", self.methods), ("--growth", growth)):
             for name in names:
                 if name not in known:

@@ -58,7 +58,7 @@ class Comparison:
     """A comparison as a config of configs/compare describes it.
 
     `variant` is a config of configs/variant that changes every trained method; METHOD@VARIANT applies a further one to
-    a single method. `name` includes the scale or the data if they differ from the config's.
+    a single method. `name` includes the scale and the data if they differ from the config's.
     """
 
     name: str
@@ -89,16 +89,18 @@ class Comparison:
         own = read_configs([file])
         changes = {"scale": scale, "data": data, "methods": methods}
         content = parse(_Content, own | {key: value for key, value in changes.items() if value}, file)
-        changed = [(key, value) for key, value in changes.items() if isinstance(value, str) and value != own.get(key)]
-        # Methods in subfolders take part only where a comparison names them.
-        chosen = content.methods or [name for name in config_names("model") if "/" not in name]
+        full_name = file.stem
+        for key, value in (("scale", scale), ("data", data)):
+            if value and find_config(key, value) != find_config(key, str(own.get(key))):
+                name = find_config(key, value).stem
+                full_name = name if name.startswith(f"{full_name}_") else f"{full_name}_{name}"
         return cls(
-            name="-".join([file.stem, *(find_config(key, value).stem for key, value in changed)]),
+            name=full_name,
             data=find_config("data", content.data),
             scale=find_config("scale", content.scale),
             variant=find_config("variant", content.variant) if content.variant else None,
             table=content.table,
-            methods=sorted(chosen, key=order),
+            methods=sorted(content.methods or all_methods(), key=order),
             seeds=list(range(content.seed, content.seed + seeds)),
             precision=precision,
         )
@@ -112,6 +114,11 @@ class Comparison:
         name, _, variant = method.partition("@")
         variants = [self.variant, find_config("variant", variant) if variant else None]
         return [str(path) for path in (self.data, find_config("model", name), self.scale, *filter(None, variants))]
+
+
+def all_methods() -> list[str]:
+    """Return the methods in configs/model except those of the static ablation, compared only with each other."""
+    return sorted((name for name in config_names("model") if not name.startswith("ablation_")), key=order)
 
 
 def build_if_untrained(method: str) -> Method | None:

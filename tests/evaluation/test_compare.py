@@ -190,7 +190,7 @@ def more_methods(world):
 
 
 def methods():
-    return {path.stem for path in (CONFIGS / "model").glob("*.yaml")}
+    return set(comparison.all_methods())
 
 
 def test_table(world):
@@ -531,15 +531,16 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("scale", "data", "name"),
     [
-        (None, None, "table2"),
-        ("small", "real/dynamic_moving_lights", "table2"),
-        ("demo", None, "table2-demo"),
-        ("demo", "real/static_egg", "table2-demo-real-static_egg"),
-        ("there/large.yaml", None, "table2-large"),
+        (None, None, "demo"),
+        ("demo", "data/demo.yaml", "demo"),
+        ("small", None, "demo_small"),
+        ("small", "real_egg", "demo_small_real_egg"),
+        (None, "demo_fixed_lights", "demo_fixed_lights"),
+        ("there/large.yaml", None, "demo_large"),
     ],
 )
 def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
-    assert comparison.Comparison.load("table2", scale, data, None).name == name
+    assert comparison.Comparison.load("demo", scale, data, None).name == name
 
 
 def test_what_is_judged_is_kept(world, monkeypatch):

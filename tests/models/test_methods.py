@@ -128,7 +128,7 @@ def test_doubled_exposure_of_halved_light(method):
     torch.testing.assert_close(method(batch), expected)
 
 
-@pytest.mark.parametrize("name", ["nlt_photons", "leaner/photons"])
+@pytest.mark.parametrize("name", ["nlt_photons", "photons_only"])
 def test_splitting_the_photons(name):
     """Each photon as two of half the flux: the same light, the same prediction."""
     batch, method = synthetic_batch(), build(find_config("model", name)).eval()
@@ -176,7 +176,7 @@ def test_a_scale_without_class_path_is_merged(tmp_path):
     assert method.hparams["depth"] == 1 and method.hparams["photons"]
 
 
-@pytest.mark.parametrize("name", ["cnn", "nlt_photons", "leaner/photons"])
+@pytest.mark.parametrize("name", ["cnn", "nlt_photons", "photons_only"])
 def test_sizes(name):
     """From tiny to the paper's, which are the defaults; each has more parameters than the one before."""
     files = {size: find_config("variant", size) for size in config_names("variant")}

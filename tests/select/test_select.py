@@ -439,7 +439,7 @@ def test_mistakes(space, tmp_path, monkeypatch, capsys, change, said):
 def test_only_advice(tmp_path, monkeypatch, capsys):
     """The command, on a scene that it looks at in a process of its own."""
     content = yaml.safe_load((CONFIGS / "select/demo.yaml").read_text())
-    config = write(tmp_path / "advice.yaml", {**content, "data": "static_egg"})
+    config = write(tmp_path / "advice.yaml", {**content, "data": "builtin_egg"})
     monkeypatch.chdir(tmp_path)
     assert main(["select", "--config", str(config), "--advice"]) == 0
     said = capsys.readouterr().out
