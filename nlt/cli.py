@@ -23,9 +23,8 @@ _LIGHTNING = {
 _FRAMES = ("bench", "compare", "render")
 
 # Help texts of several commands.
-_OUT, _IMAGE = "directory for the results (default: {})", "image file to write (default: {})"
+_IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
-_VIEWS, _SIDE = "random views per scene", "image height and width in pixels"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,11 +104,6 @@ def _run(arguments: list[str]) -> int:
         dashboard(options.directory, options.dashboard)
     elif options.command == "scenes":
         _scenes(options)
-    elif options.command == "teachers":
-        from nlt.bench.teachers import teachers
-
-        size = options.resolution
-        teachers(options.names, options.out, options.seconds, size, options.views, options.experiment, options.seed)
     return 0
 
 
@@ -264,23 +258,8 @@ def _parser() -> argparse.ArgumentParser:
         "--dashboard", nargs="?", type=_whole, const=6006, metavar="PORT",
         help="show the training runs and results in TensorBoard instead (default port: 6006; 0 takes a free one)",
     )  # fmt: skip
-    teachers = commands.add_parser("teachers", help="compare the integrators path and bdpt: variance at equal time")
-    _add_views(teachers, seconds=(60, "seconds of rendering per integrator"), resolution=(64, _SIDE), views=(4, _VIEWS))
-    teachers.add_argument("--out", type=Path, default=Path("results/teachers"), help=_OUT.format("results/teachers"))
     _add_scenes(commands.add_parser("scenes", help="list, show, check, add or preview scenes"))
     return parser
-
-
-def _add_views(parser: argparse.ArgumentParser, **numbers: tuple[int, str]) -> None:
-    """Add the scenes and the options of how to render them."""
-    parser.add_argument("names", nargs="+", help="scene descriptions in configs/scenes, by name or path")
-    for name, (default, text) in numbers.items():
-        parser.add_argument(f"--{name}", type=_positive, default=default, help=f"{text} (default: {default})")
-    parser.add_argument(
-        "--experiment", type=_experiment, default="fixed_lights",
-        help="static, fixed_lights or moving_lights (default: fixed_lights)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=_whole, default=0, help="seed of states, views and noise (default: 0)")
 
 
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
@@ -310,7 +289,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
         "--growth", nargs="*", metavar="METHOD",
         help="also vary resolution, points, photons, width and batch (without METHOD: of nlt_photons)",
     )  # fmt: skip
-    parser.add_argument("--out", default="results/bench", help=_OUT.format("results/bench"))
+    parser.add_argument("--out", default="results/bench", help="directory for the results (default: results/bench)")
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
@@ -345,7 +324,17 @@ def _add_scenes(parser: argparse.ArgumentParser) -> None:
     add.add_argument("-o", "--output", type=Path, help="file to write (default: configs/scenes/NAME.yaml)")
     preview = actions.add_parser("preview", help="draw a contact sheet with one row of random views per scene")
     preview.add_argument("-o", "--output", type=_picture, default="preview.png", help=_IMAGE.format("preview.png"))
-    _add_views(preview, views=(4, _VIEWS), resolution=(256, _SIDE), spp=(64, "samples per pixel"))
+    preview.add_argument("names", nargs="+", help="scene descriptions in configs/scenes, by name or path")
+    preview.add_argument("--views", type=_positive, default=4, help="random views per scene (default: 4)")
+    preview.add_argument(
+        "--resolution", type=_positive, default=256, help="image height and width in pixels (default: 256)"
+    )
+    preview.add_argument("--spp", type=_positive, default=64, help="samples per pixel (default: 64)")
+    preview.add_argument(
+        "--experiment", type=_experiment, default="fixed_lights",
+        help="static, fixed_lights or moving_lights (default: fixed_lights)",
+    )  # fmt: skip
+    preview.add_argument("--seed", type=_whole, default=0, help="seed of states, views and noise (default: 0)")
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:

@@ -91,7 +91,7 @@ def test_help_of_fit(capfd):
         (["generate"], ["--config", "nlt generate --help"]),
         (["generate", "--config=x.yaml", "--workers=0"], ["--workers", "at least 1"]),
         (["generate", "--config=x.yaml", "--workers=two"], ["--workers", "whole number", "two"]),
-        (["teachers", "egg", "--seed=-1"], ["--seed", "at least 0"]),
+        (["scenes", "preview", "egg", "--seed=-1"], ["--seed", "at least 0"]),
         (["scenes", "preview", "egg", "-o", "egg.xyz"], ["--output", "egg.xyz", ".png"]),
         (["generate", "--config=x.yaml", "--nope"], ["--nope", "--help"]),
         (["generate", "--config=x.yaml", "--slurm=time"], ["--slurm", "KEY=VALUE", "time"]),

@@ -1,1 +1,1 @@
-"""`nlt bench`: the cost of a frame, a training step and a sample; `nlt teachers`: the better of two integrators."""
+"""`nlt bench`: the cost of a frame, a training step and a sample."""
