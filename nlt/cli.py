@@ -129,9 +129,9 @@ def _draw(directory: str | Path, megabytes: int | None = None) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    from nlt.bench.run import bench
+    from nlt.bench.run import Benchmark
 
-    bench(
+    benchmark = Benchmark(
         out=options.out,
         data=options.data,
         scale=options.scale,
@@ -142,6 +142,7 @@ def _bench(options: argparse.Namespace) -> None:
         seconds=options.seconds,
         growth=["nlt_photons"] if options.growth == [] else options.growth,
     )
+    benchmark.run()
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -283,7 +284,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
         help="override resolution, points, photons, width, depth, batch_size, workers or batch (frames at a time)",
     )  # fmt: skip
     parser.add_argument("--ckpt", help="checkpoint of the only method (default: random weights)")
-    parser.add_argument("--device", help="cpu or cuda (default: cuda if available)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="cpu or cuda (default: cuda if available)")
     parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
     parser.add_argument(
         "--growth", nargs="*", metavar="METHOD",

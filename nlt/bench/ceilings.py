@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -52,11 +53,18 @@ def rendering(render: SampleRenderer, seconds: float) -> dict[str, float]:
     return {name: best(call, cpu, seconds / len(calls)) for name, call in calls.items()}
 
 
+def repeat(seconds: float, least: int, most: float = math.inf) -> Iterator[int]:
+    """Yield 0, 1, 2, ... until `seconds` are over, but `least` to `most` times."""
+    begin, k = time.perf_counter(), 0
+    while k < least or (k < most and time.perf_counter() - begin < seconds):
+        yield k
+        k += 1
+
+
 def best(call: Callable[[], object], device: torch.device, seconds: float) -> float:
     """Return the least seconds of a call, repeated for `seconds` and at least once, after a warm-up call."""
-    times: list[float] = []
-    begin = time.perf_counter()
-    while len(times) < 2 or time.perf_counter() - begin < seconds:
+    times = []
+    for _ in repeat(seconds, least=2):
         start = time.perf_counter()
         call()
         if device.type == "cuda":
