@@ -34,15 +34,16 @@ def paired_difference(errors: np.ndarray, others: np.ndarray) -> tuple[float, fl
     return mean, float(np.sqrt(max(by_image + by_seed - noise, by_image, by_seed)))
 
 
-def within(errors: Errors[Key], limit: float = 1.0) -> list[Key]:
-    """Return the keys whose mean error is within `limit` paired standard errors of the best mean."""
-    best = min(errors, key=lambda key: errors[key].mean())
-    good = []
-    for key in errors:
-        mean, error = paired_difference(errors[key], errors[best])
-        if mean <= limit * error:
-            good.append(key)
-    return good
+def best(errors: Errors[Key]) -> Key:
+    """Return the key with the least mean error."""
+    return min(errors, key=lambda key: errors[key].mean())
+
+
+def within(errors: Errors[Key]) -> list[Key]:
+    """Return the keys whose mean error is within one paired standard error of the best mean."""
+    least = errors[best(errors)]
+    differences = {key: paired_difference(own, least) for key, own in errors.items()}
+    return [key for key, (mean, error) in differences.items() if mean <= error]
 
 
 def choose(metrics: Sequence[Errors[Key]], cost: Mapping[Key, float]) -> Key:

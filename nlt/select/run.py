@@ -17,7 +17,7 @@ from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.metrics.quantities import COSTS
 from nlt.select import advice
-from nlt.select.choice import choose, paired_difference
+from nlt.select.choice import best, choose, paired_difference
 from nlt.select.output import draw_front, markdown
 from nlt.select.search import Search
 from nlt.select.space import Candidate, SearchSpace
@@ -56,8 +56,8 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
     parameters = {c: float(search.entries[c].cost["parameters"]) for c in finals}
     errors = [search.errors(finals, key) for key in SCORES]
-    best = min(finals, key=lambda c: errors[0][c].mean())
-    picks = {CHOSEN: choose(errors, times), FULL: space.full, BEST: best, FEWEST: choose(errors, parameters)}
+    picks = {CHOSEN: choose(errors, times), FULL: space.full}
+    picks |= {BEST: best(errors[0]), FEWEST: choose(errors, parameters)}
     if space.full not in finals:
         print("the full model was not trained to the end, so nothing is compared with it", flush=True)
         del picks[FULL]
@@ -71,7 +71,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
         **begun,
         **surroundings(search.device, search.policy),
         "select": space.name,
-        **{key: getattr(space, key) for key in ("methods", "sizes", "points", "photons", "minutes")},
+        **space.model_dump(include={"methods", "sizes", "points", "photons", "minutes"}),
         "seeds": search.seeds,
         "rungs": search.rounds,
         "budget_spent_min": round(search.spent / 60, 2),
@@ -99,7 +99,6 @@ def _chosen(space: SearchSpace, candidate: Candidate) -> str:
 def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Row]:
     """Return a row per candidate of the space: validation scores, and paired differences from the best."""
     errors = {key: search.errors(finals, key) for key in SCORES}
-    best = {key: min(own, key={c: e.mean() for c, e in own.items()}.__getitem__) for key, own in errors.items()}
     rows = []
     for candidate in search.space.candidates:
         row: Row = {"candidate": candidate.name, **asdict(candidate), "chosen": int(candidate == chosen)}
@@ -112,15 +111,14 @@ def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Ro
                 scores = search.scores(candidate, key, seeds)
                 row[key] = scores.mean()
                 if candidate in finals:
-                    pair = errors[key][candidate], errors[key][best[key]]
-                    row[f"{key}_behind"], row[f"{key}_behind_error"] = paired_difference(*pair)
+                    behind = paired_difference(errors[key][candidate], errors[key][best(errors[key])])
+                    row[f"{key}_behind"], row[f"{key}_behind_error"] = behind
         rows.append(row)
     return rows
 
 
 def _confirm(search: Search, picks: dict[str, Candidate]) -> list[Row]:
-    """Return the picks' scores on the test split, which no decision has used, and paired differences from the full
-    model."""
+    """Return the picks' scores on the unused test split, and paired differences from the full model."""
     scores_of = {c: [_test_scores(search, c, seed) for seed in search.seeds] for c in set(picks.values())}
     rows = []
     for role, candidate in picks.items():
@@ -144,11 +142,10 @@ def _test_scores(search: Search, candidate: Candidate, seed: int) -> dict[str, l
 
 def _views(search: Search, finals: list[Candidate]) -> list[Row]:
     """Return the scores of every validation image for the candidates that were trained longest."""
-    rows = []
-    for candidate in finals:
-        scores = {key: search.scores(candidate, key, search.seeds) for key in SCORES}
-        for s, seed in enumerate(search.seeds):
-            for view in range(scores[SCORES[0]].shape[1]):
-                view_scores = {key: float(values[s, view]) for key, values in scores.items()}
-                rows.append({"candidate": candidate.name, "seed": seed, "view": view, **view_scores})
-    return rows
+    scores = {(c, key): search.scores(c, key, search.seeds) for c in finals for key in SCORES}
+    return [
+        {"candidate": c.name, "seed": seed, "view": view} | {key: scores[c, key][s, view] for key in SCORES}
+        for c in finals
+        for s, seed in enumerate(search.seeds)
+        for view in range(scores[c, SCORES[0]].shape[1])
+    ]

@@ -42,7 +42,6 @@ now = time.perf_counter
 class Entry:
     """A candidate's record: its times and sizes, the steps it was trained for, and why it was not trained longer."""
 
-    candidate: Candidate
     cost: dict[str, Any]
     steps: int = 0
     status: str = ""
@@ -68,10 +67,9 @@ class Search:
         self.entries: dict[Candidate, Entry] = {}
         self.seeds = [0]
         self._ratios: list[float] = []  # measured over initially estimated time of each training
-        trainer = space.config(space.full)
-        self._most, batch_size = trainer["trainer"]["max_steps"], trainer["data"].get("batch_size", 32)
-        self._epoch = max(1, len(space.spec.scenes) * space.spec.train // batch_size)
-        self._batch_size = batch_size
+        config = space.config(space.full)
+        self._most, self._batch_size = config["trainer"]["max_steps"], config["data"].get("batch_size", 32)
+        self._epoch = max(1, len(space.spec.scenes) * space.spec.train // self._batch_size)
 
     # --- the plan ---
 
@@ -88,17 +86,15 @@ class Search:
         self.rounds, self.spent = plan["rungs"], plan["spent_s"]
         torch.set_num_threads(plan["threads"])
         costs = dict(zip(self.space.candidates, plan["costs"], strict=False))
-        self.entries = {candidate: Entry(candidate, cost) for candidate, cost in costs.items()}
+        self.entries = {candidate: Entry(cost) for candidate, cost in costs.items()}
         order = list(self.entries)
         fit = max((n for n in range(2, len(order) + 1) if self._fits(order, n, self.rounds)), default=2)
         counts = zip(self._counts(self.rounds, fit), self.rounds, strict=True)
-        print(
-            f"{fit} of {len(self.space.candidates)} candidates fit into {self.space.minutes:g} min: "
-            + ", ".join(f"{n} for {steps} steps" for n, steps in counts)
-            + (f", the last with {self.space.seeds} seeds" if self.space.seeds > 1 else "")
-            + f"; about {(self.spent + self._cost(order[:fit], self.rounds)) / 60:.1f} min in all",
-            flush=True,
-        )
+        rounds = ", ".join(f"{n} for {steps} steps" for n, steps in counts)
+        seeds = f", the last with {self.space.seeds} seeds" if self.space.seeds > 1 else ""
+        total = (self.spent + self._cost(order[:fit], self.rounds)) / 60
+        print(f"{fit} of {len(self.space.candidates)} candidates fit into {self.space.minutes:g} min: {rounds}{seeds}; "
+              f"about {total:.1f} min in all", flush=True)  # fmt: skip
 
     def _plan(self) -> dict[str, Any]:
         """Return the rounds' steps and every candidate's cost per step and, with interleaved timing, per frame."""
@@ -107,7 +103,7 @@ class Search:
         for candidate in self.space.candidates:
             if now() - begin > _TIMING * self.budget and len(self.entries) >= 2:
                 break
-            self.entries[candidate] = Entry(candidate, {"step_s": self._step_s(self.space.build(candidate))})
+            self.entries[candidate] = Entry({"step_s": self._step_s(self.space.build(candidate))})
         order, enough = list(self.entries), min(_ENOUGH, len(self.entries))
         self.spent = now() - begin + _TIMING * self.budget
         while not self._fits(order, enough, rounds) and rounds[-1] > self._epoch:

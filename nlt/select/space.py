@@ -9,14 +9,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from nlt.config import merge, read_configs
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationInfo, field_validator
+
+from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath
-from nlt.data.spec import DatasetSpec, check_keys, load_spec
+from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
-
-_KEYS = ("data", "scale", "methods", "sizes", "points", "photons", "minutes", "seeds")
 
 
 @dataclass(frozen=True)
@@ -41,22 +41,39 @@ class Candidate:
         return "-".join(str(part) for part in parts if part)
 
 
-@dataclass(frozen=True)
-class SearchSpace:
+class SearchSpace(Settings):
     """The candidates: every method in every size, with every number of points and of photons that it reads.
 
-    `methods` and `sizes` keep the config's order, `points` and `photons` ascend. The last ones make the full model.
+    `methods` and `sizes` go from the leanest to the largest, `points` and `photons` ascend; the last ones make the full
+    model. `data` and `scale` are configs, and `name` is the file's unless it is given.
     """
 
     name: str
-    data: Path
-    scale: Path
-    methods: tuple[str, ...]
-    sizes: tuple[str, ...]
-    points: tuple[int, ...]
-    photons: tuple[int, ...]
-    minutes: float
-    seeds: int
+    data: str
+    scale: str
+    methods: tuple[str, ...] = Field(min_length=1)
+    sizes: tuple[str, ...] = Field(min_length=1)
+    points: tuple[PositiveInt, ...] = Field(min_length=1)
+    photons: tuple[PositiveInt, ...] = Field(min_length=1)
+    minutes: PositiveFloat
+    seeds: PositiveInt = 1
+
+    @field_validator("methods", "sizes", "points", "photons")
+    @classmethod
+    def _unique(cls, values: tuple) -> tuple:
+        if len(set(values)) < len(values):
+            raise ValueError(f"must not have duplicates, is {list(values)}")
+        return values if isinstance(values[0], str) else tuple(sorted(values))
+
+    @field_validator("methods", "sizes")
+    @classmethod
+    def _known(cls, names: tuple[str, ...], field: ValidationInfo) -> tuple[str, ...]:
+        kind = "model" if field.field_name == "methods" else "variant"
+        known = config_names(kind)
+        for name in names:
+            if name not in known and not find_config(kind, name).is_file():
+                raise ValueError(f"no {name!r} in configs/{kind}; known are {', '.join(known)}")
+        return names
 
     @classmethod
     def load(cls, config: str, minutes: float | None = None) -> SearchSpace:
@@ -66,48 +83,22 @@ class SearchSpace:
             UserError: a key is unknown, missing or wrong.
         """
         file = find_config("select", config)
-        content = {"seeds": 1} | read_configs([str(file)]) | ({} if minutes is None else {"minutes": minutes})
-        check_keys(f"{file}: ", content, _KEYS, _KEYS)
-        for key in ("data", "scale"):
-            if not isinstance(content[key], str):
-                raise UserError(f"{file}: {key}: must be the name of a config in configs/{key}, is {content[key]!r}")
-        for key, kind in (("methods", "model"), ("sizes", "variant")):
-            known = config_names(kind)
-            for name in _list(file, key, content[key], str):
-                if name not in known and not find_config(kind, name).is_file():
-                    raise UserError(f"{file}: {key}: no {name!r} in configs/{kind}; known are {', '.join(known)}")
-        for key in ("points", "photons"):
-            if min(_list(file, key, content[key], int)) < 1:
-                raise UserError(f"{file}: {key}: must be at least 1, is {content[key]}")
-        if not isinstance(content["minutes"], int | float) or content["minutes"] <= 0:
-            raise UserError(f"{file}: minutes: must be a number above 0, is {content['minutes']!r}")
-        if type(content["seeds"]) is not int or content["seeds"] < 1:
-            raise UserError(f"{file}: seeds: must be a whole number of at least 1, is {content['seeds']!r}")
-        space = cls(
-            file.stem,
-            find_config("data", content["data"]),
-            find_config("scale", content["scale"]),
-            tuple(content["methods"]),
-            tuple(content["sizes"]),
-            tuple(sorted(content["points"])),
-            tuple(sorted(content["photons"])),
-            content["minutes"],
-            content["seeds"],
-        )
+        given = {} if minutes is None else {"minutes": minutes}
+        space = parse(cls, {"name": file.stem, **read_configs([file]), **given}, file)
         space._check(file)
         return space
 
     def _check(self, file: Path) -> None:
+        """Check what several configs say together."""
         for key in ("points", "photons"):
-            has, most = getattr(self.spec, key), max(getattr(self, key))
+            has, most = getattr(self.spec, key), getattr(self, key)[-1]
             if most > has:
                 raise UserError(f"{file}: {key}: {most} is more than the {has} of the dataset")
+        scale = find_config("scale", self.scale)
         for split in ("train", "val", "test"):
             if self.spec.count(split) * len(self.spec.scenes) < 2:
-                raise UserError(f"{self.scale}: data.dataset.{split}: must give at least 2 samples, gives fewer")
-        steps = read_configs([str(self.scale)]).get("trainer", {}).get("max_steps")
-        if not isinstance(steps, int) or steps < 1:
-            raise UserError(f"{self.scale}: trainer.max_steps: must be a whole number of at least 1, is {steps!r}")
+                raise UserError(f"{scale}: data.dataset.{split}: must give at least 2 samples, gives fewer")
+        parse(PositiveInt, read_configs([scale]).get("trainer", {}).get("max_steps"), scale, "trainer.max_steps")
         for method in self.methods:
             kind = pydoc.locate(str(self._config(method, self.sizes[0])["model"].get("class_path")))
             if not (isinstance(kind, type) and issubclass(kind, RenderingModule)):
@@ -115,7 +106,7 @@ class SearchSpace:
 
     @cached_property
     def _loaded(self) -> tuple[DatasetSpec, AnyPath]:
-        return load_spec([str(self.data), str(self.scale)])
+        return load_spec([str(find_config("data", self.data)), str(find_config("scale", self.scale))])
 
     @property
     def spec(self) -> DatasetSpec:
@@ -157,8 +148,8 @@ class SearchSpace:
         return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
 
     def _config(self, method: str, size: str) -> dict[str, Any]:
-        files = (self.data, find_config("model", method), self.scale, find_config("variant", size))
-        return read_configs([str(file) for file in files])
+        files = (("data", self.data), ("model", method), ("scale", self.scale), ("variant", size))
+        return read_configs([find_config(kind, name) for kind, name in files])
 
     def build(self, candidate: Candidate) -> RenderingModule:
         """Return the candidate's untrained model."""
@@ -171,15 +162,6 @@ class SearchSpace:
             raise UserError(f"{find_config('model', candidate.method)}: model.init_args: {error}") from None
         assert isinstance(module, RenderingModule)
         return module
-
-
-def _list(file: Path, key: str, value: Any, kind: type) -> list[Any]:
-    if not isinstance(value, list) or not value or any(type(item) is not kind for item in value):
-        expected = "names" if kind is str else "whole numbers"
-        raise UserError(f"{file}: {key}: must be a list of {expected}, is {value!r}")
-    if len(set(value)) < len(value):
-        raise UserError(f"{file}: {key}: must not have duplicates, is {value}")
-    return value
 
 
 def _van_der_corput(k: int, count: int) -> int:

@@ -416,16 +416,16 @@ def test_budget(space, monkeypatch, capsys, slower):
     [
         ({"method": ["cnn"]}, "method: unknown key"),
         ({"methods": ["cnm"]}, "methods: no 'cnm'"),
-        ({"methods": []}, "methods: must be a list of names"),
+        ({"methods": []}, "methods: must be a list of at least 1"),
         ({"methods": ["oidn_1"]}, "methods: oidn_1 is not trained"),
         ({"points": [65]}, "points: 65 is more than the 64"),
-        ({"photons": [0]}, "photons: must be at least 1"),
+        ({"photons": [0]}, "photons.0: must be above 0"),
         ({"photons": [8, 8]}, "photons: must not have duplicates"),
-        ({"minutes": 0}, "minutes: must be a number above 0"),
+        ({"minutes": 0}, "minutes: must be above 0"),
         ({"minutes": 1e-3}, "--minutes: 0.001 are too few"),
-        ({"seeds": 0}, "seeds: must be a whole number"),
+        ({"seeds": 0}, "seeds: must be above 0"),
         ({"scale": "none"}, "cannot be read"),
-        ({"data": None}, "data: must be the name"),
+        ({"data": None}, "data: must be a text"),
     ],
 )
 def test_mistakes(space, tmp_path, monkeypatch, capsys, change, said):
