@@ -46,8 +46,8 @@ STAGES = {
     "flip": (image_metrics, "flip"),
     "mssim": (image_metrics, "structural_similarity_index_measure"),
     "feature_l1": (image_metrics, "feature_l1"),
-    "fid": (image_metrics.FID, "compute"),
-    "kid": (image_metrics.KID, "compute"),
+    "fid": (image_metrics, "frechet_distance"),
+    "kid": (image_metrics, "kernel_distance"),
     "jackknife": (judge, "fid_and_kid_without"),
     "cache_write": (feature_cache, "write_shard"),
 }
@@ -78,7 +78,7 @@ def before_and_after(turns: int = 2) -> dict[str, float]:
     torch.manual_seed(0)
     file, images = find_weights(), torch.rand(16, 3, 64, 64)
     assert file is not None
-    plain, used = _read_model(file), load_inception()
+    plain, used = _read_model(file), load_inception(images.device)
     features = torch.rand(256, 2048, dtype=torch.float64), torch.rand(256, 2048, dtype=torch.float64) ** 2
     pooled = torch.nn.Identity()
     pooled.num_features = 2048  # type: ignore[assignment]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
 import hashlib
 import json
 import logging
@@ -40,6 +39,7 @@ from nlt.data.spec import DatasetSpec, load_spec
 from nlt.data.store import dataset_files
 from nlt.errors import UserError
 from nlt.evaluation.provenance import origin, surroundings
+from nlt.evaluation.results import write_manifest, write_rows
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import Batch, RenderingModule
@@ -233,16 +233,12 @@ def main() -> None:
                 write_bytes(record, json.dumps(judge(module, batches, snapshots)).encode())
             about = {"arm": label(size), "seed": seed, "generation_s": generation.get(size or 0, 0.0)}
             rows += [about | row for row in json.loads(record.read_text())]
-            out.mkdir(parents=True, exist_ok=True)
-            with (out / "table.csv").open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
+            write_rows(out / "table.csv", rows)
             write_table(out / "table.md", rows, [options.minutes * 60 * share for share in (0.25, 0.5, 0.75, 1)])
             draw(out / "curve.png", rows)
             details = {"configs": config, "lr_decay": 1.0, "n_test": len(test), "generation_s": generation}
-            manifest = begun | surroundings(device) | details | {"minutes": options.minutes, "seeds": options.seeds}
-            write_bytes(out / "manifest.json", (json.dumps(manifest, indent=1, default=str) + "\n").encode())
+            details |= {"minutes": options.minutes, "seeds": options.seeds}
+            write_manifest(out, begun | surroundings(device) | details)
     print((out / "table.md").read_text())
 
 

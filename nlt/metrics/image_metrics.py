@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import flip_evaluator
@@ -11,13 +10,12 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric, MetricCollection
 from torchmetrics.functional.image import structural_similarity_index_measure
-from torchmetrics.image.kid import KernelInceptionDistance
 from torchmetrics.utilities import dim_zero_cat
 
 from nlt.metrics.display import display, expose
 from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.inception import STAGES, load_inception
-from nlt.metrics.jackknife import frechet_distance
+from nlt.metrics.jackknife import frechet_distance, kernel_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
 SLOW = ("flip", *PERCEPTUAL)
@@ -66,49 +64,26 @@ def feature_l1(prediction: dict[str, Tensor], reference: dict[str, Tensor]) -> d
     return {key: mean(difference(layer)) for key, layer in layers.items()}
 
 
-class _FeatureDistance(KernelInceptionDistance):
-    """Collects the pooled features (N, 2048) of predictions and references."""
+class FeatureDistances(Metric):
+    """FID and KID of the pooled Inception features (N, 2048) of all predictions and references."""
+
+    predictions: list[Tensor]
+    references: list[Tensor]
 
     def __init__(self) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # it warns that it keeps all features
-            super().__init__(feature=nn.Identity())
-        for name in ("real_features", "fake_features"):  # "cat" allows different numbers of batches per process
+        super().__init__()
+        for name in ("predictions", "references"):  # "cat" allows different numbers of batches per process
             self.add_state(name, [], dist_reduce_fx="cat")
 
-    def features(self) -> tuple[Tensor, Tensor]:
-        """Return the features of the predictions and those of the references."""
-        return dim_zero_cat(self.fake_features), dim_zero_cat(self.real_features)
+    def update(self, prediction: Tensor, reference: Tensor) -> None:  # type: ignore[override]
+        """Add the features (B, 2048) of a batch."""
+        self.predictions.append(prediction.double())
+        self.references.append(reference.double())
 
-
-class FID(_FeatureDistance):
-    """Fréchet distance of Gaussians fitted to the pooled features (N, 2048), in float64.
-
-    torchmetrics' FID gives the same value, but takes seconds for the eigenvalues of a 2048 x 2048 matrix. The FID is
-    NaN for fewer than two samples. A small N biases it upwards, so compare only values with equal N and references.
-    """
-
-    def compute(self) -> Tensor:  # type: ignore[override]
-        """Return the distance, a scalar."""
-        return frechet_distance(*self.features())
-
-
-class KID(_FeatureDistance):
-    """Kernel distance of the pooled features (N, 2048). It is unbiased, so values with different N are comparable.
-
-    Up to 1000 samples are compared at once; with more, 100 random subsets of 1000 are used. The KID is NaN for fewer
-    than two samples.
-    """
-
-    def compute(self) -> Tensor:  # type: ignore[override]
-        """Return the distance, a scalar."""
-        count = len(self.features()[1])
-        if count < 2:
-            return torch.full((), torch.nan, device=self.device)
-        self.subset_size, self.subsets = (count, 1) if count <= 1000 else (1000, 100)
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            return super().compute()[0]
+    def compute(self) -> dict[str, Tensor]:  # type: ignore[override]
+        """Return scalars by the keys "fid" and "kid"."""
+        features = dim_zero_cat(self.predictions), dim_zero_cat(self.references)
+        return {"fid": frechet_distance(*features), "kid": kernel_distance(*features)}
 
 
 class ImageMetrics(nn.Module):
@@ -127,7 +102,7 @@ class ImageMetrics(nn.Module):
         }
         self.means = MetricCollection(means, compute_groups=False)
         if perceptual:
-            self.fid, self.kid = FID(), KID()
+            self.distances = FeatureDistances()
 
     @torch.no_grad()
     def update(
@@ -161,9 +136,7 @@ class ImageMetrics(nn.Module):
                 # One pass serves all perceptual metrics; prediction and reference are separate to halve the memory.
                 shown_features, of_reference = inception(shown), of_reference or inception(target)
                 values |= feature_l1(shown_features, of_reference)
-                for distance in (self.fid, self.kid):
-                    distance.update(shown_features["pool"].double(), real=False)
-                    distance.update(of_reference["pool"].double(), real=True)
+                self.distances.update(shown_features["pool"], of_reference["pool"])
                 values["pool"] = shown_features["pool"]
             else:
                 values |= {key: torch.full_like(mse, torch.nan) for key in PERCEPTUAL if METRICS[key].per_image}
@@ -186,10 +159,9 @@ class ImageMetrics(nn.Module):
     def compute(self) -> dict[str, Tensor]:
         """Return scalars over all updates in all processes, by the keys of `METRICS`."""
         values = self.means.compute()
-        if self.perceptual and load_inception(values["mse"].device):
-            values |= {"fid": self.fid.compute(), "kid": self.kid.compute()}
-        elif self.perceptual:
-            values |= dict.fromkeys(("fid", "kid"), torch.full_like(values["mse"], torch.nan))
+        if self.perceptual:
+            nan = torch.full_like(values["mse"], torch.nan)
+            values |= self.distances.compute() if load_inception(nan.device) else {"fid": nan, "kid": nan}
         return {key: values[key] for key in METRICS if key in values}
 
     def reset(self) -> None:

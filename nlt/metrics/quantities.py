@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 # The stages of a frame, first rendered, then computed. A method's time includes only the stages that it needs.
@@ -33,30 +34,20 @@ _LINEAR = "radiance × exposure"
 _FEATURES = "Inception features of sRGB"
 
 
-def _image(
-    label: str,
-    direction: Literal["lower", "higher"],
-    form: str,
-    domain: str,
-    unit: str = "1",
-    per_image: bool = True,
-    perfect: float | None = 0.0,
-) -> Quantity:
-    return Quantity(label, direction, form, unit, domain=domain, per_image=per_image, perfect=perfect)
-
+_image = partial(Quantity, per_image=True, perfect=0.0)
 
 METRICS: dict[str, Quantity] = {
-    "mse": _image("MSE", "lower", ".5f", _DISPLAY),
-    "unbiased_mse": _image("Unbiased MSE", "lower", ".3e", _LINEAR),
-    "reference_noise": _image("Reference noise", "lower", ".3e", _LINEAR),
-    "psnr": _image("PSNR", "higher", ".2f", _DISPLAY, "dB", perfect=None),
-    "mssim": _image("MSSIM", "higher", ".4f", _DISPLAY, perfect=1.0),
-    "flip": _image("FLIP", "lower", ".4f", _DISPLAY),
-    "fid": _image("FID", "lower", ".2f", _FEATURES, per_image=False),
-    "kid": _image("KID", "lower", ".4f", _FEATURES, per_image=False),
-    "feature_l1": _image("Feature L1", "lower", ".4f", f"{_FEATURES}, final pooling"),
+    "mse": _image("MSE", "lower", ".5f", domain=_DISPLAY),
+    "unbiased_mse": _image("Unbiased MSE", "lower", ".3e", domain=_LINEAR),
+    "reference_noise": _image("Reference noise", "lower", ".3e", domain=_LINEAR),
+    "psnr": _image("PSNR", "higher", ".2f", "dB", domain=_DISPLAY, perfect=None),
+    "mssim": _image("MSSIM", "higher", ".4f", domain=_DISPLAY, perfect=1.0),
+    "flip": _image("FLIP", "lower", ".4f", domain=_DISPLAY),
+    "fid": _image("FID", "lower", ".2f", domain=_FEATURES, per_image=False),
+    "kid": _image("KID", "lower", ".4f", domain=_FEATURES, per_image=False),
+    "feature_l1": _image("Feature L1", "lower", ".4f", domain=f"{_FEATURES}, final pooling"),
     **{
-        f"feature_l1_{stage}": _image(f"Feature L1, layer {stage[-1]}", "lower", ".4f", f"{_FEATURES}, {stage}")
+        f"feature_l1_{stage}": _image(f"Feature L1, layer {stage[-1]}", "lower", ".4f", domain=f"{_FEATURES}, {stage}")
         for stage in INCEPTION_STAGES
     },
 }

@@ -14,16 +14,19 @@ import torch.multiprocessing as mp
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional as F
 from torchmetrics.image.fid import FrechetInceptionDistance
+from torchmetrics.image.kid import KernelInceptionDistance
 
 from nlt.errors import UserError
 from nlt.metrics import inception as inception_module
 from nlt.metrics import jackknife
 from nlt.metrics.display import display
 from nlt.metrics.feature_cache import cached_features
-from nlt.metrics.image_metrics import FID, KID, SLOW, ImageMetrics, feature_l1, flip, unbiased_mse
+from nlt.metrics.image_metrics import SLOW, FeatureDistances, ImageMetrics, feature_l1, flip, unbiased_mse
 from nlt.metrics.inception import STAGES, Inception, find_weights, load_inception
-from nlt.metrics.jackknife import frechet_distance
+from nlt.metrics.jackknife import frechet_distance, kernel_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
+
+CPU = torch.device("cpu")
 
 
 @pytest.fixture(autouse=True)
@@ -38,9 +41,9 @@ def one_thread():
 @pytest.fixture
 def uncached():
     """Lets the test look for the weights afresh, and leaves no trace of what it found."""
-    inception_module._load.cache_clear()
+    load_inception.cache_clear()
     yield
-    inception_module._load.cache_clear()
+    load_inception.cache_clear()
 
 
 @pytest.fixture
@@ -154,40 +157,36 @@ def test_fid_matches_sqrtm():
     decay = np.arange(1, 2049) ** -0.5
     real = np.abs(rng.standard_normal((64, 2048)) * decay)
     fake = np.abs(rng.standard_normal((64, 2048)) * decay * 1.3 + 0.02)
-    metric = FID()
-    for features, is_real in ((real, True), (fake, False)):
-        for part in np.array_split(features, 3):
-            metric.update(torch.from_numpy(part), real=is_real)
+    metric = FeatureDistances()
+    for parts in zip(np.array_split(fake, 3), np.array_split(real, 3), strict=True):
+        metric.update(*map(torch.from_numpy, parts))
     # Both covariances have rank 63, so sqrtm is taken in the basis of the features' span, where it exists.
     basis = np.linalg.qr(np.concatenate([real, fake]).T)[0]
     (m1, c1), (m2, c2) = ((x.mean(0), np.cov((x @ basis).T)) for x in (real, fake))
     root = scipy.linalg.sqrtm(c1 @ c2).real
     expected = np.sum((m1 - m2) ** 2) + np.trace(c1 + c2 - 2 * root)
-    assert metric.compute().item() == pytest.approx(expected, rel=1e-3)
+    assert metric.compute()["fid"].item() == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(("real", "fake"), [(40, 40), (30, 50), (8, 90)])
 def test_fid_is_torchmetrics(real, fake, monkeypatch):
     """Of sets of different size, of more and of fewer images than features."""
-    features = torch.nn.Identity()
-    features.num_features = 24
-    metrics = FID(), FrechetInceptionDistance(feature=features)
+    network = torch.nn.Identity()
+    network.num_features = 24
+    metric, sets = FrechetInceptionDistance(feature=network), {}
     generator = torch.Generator().manual_seed(0)
-    for metric in metrics:
-        generator.manual_seed(0)
-        for count, is_real in ((real, True), (fake, False)):
-            sample = torch.rand(count, 24, generator=generator, dtype=torch.float64) ** (1 + is_real)
-            for part in sample.split(7):
-                metric.update(part, real=is_real)
-    ours, theirs = (metric.compute().item() for metric in metrics)
+    for count, is_real in ((real, True), (fake, False)):
+        sets[is_real] = torch.rand(count, 24, generator=generator, dtype=torch.float64) ** (1 + is_real)
+        for part in sets[is_real].split(7):
+            metric.update(part, real=is_real)
+    ours, theirs = frechet_distance(sets[False], sets[True]).item(), metric.compute().item()
     assert ours == pytest.approx(theirs, rel=1e-3 if real < 24 else 1e-9)  # their eigenvalues of 0 are not quite
 
 
-def test_fid_of_one_sample_is_nan():
-    metric = FID()
-    for real in (True, False):
-        metric.update(torch.rand(1, 2048), real=real)
-    assert metric.compute().isnan()
+def test_distances_of_one_sample_are_nan():
+    metric = FeatureDistances()
+    metric.update(torch.rand(1, 2048), torch.rand(1, 2048))
+    assert all(value.isnan() for value in metric.compute().values())
 
 
 def test_feature_l1_matches_numpy():
@@ -204,15 +203,29 @@ def test_kid_is_the_unbiased_mmd():
     """Against the definition: a cubic kernel, the means over pairs of different samples."""
     generator = torch.Generator().manual_seed(0)
     real, fake = torch.rand(9, 2048, generator=generator), 1.2 * torch.rand(9, 2048, generator=generator)
-    metric = KID()
-    for features, is_real in ((real, True), (fake, False)):
-        for part in features.split(4):
-            metric.update(part, real=is_real)
+    metric = FeatureDistances()
+    for parts in zip(fake.split(4), real.split(4), strict=True):
+        metric.update(*parts)
     x, y = real.double().numpy(), fake.double().numpy()
     kernel = lambda a, b: (a @ b.T / 2048 + 1) ** 3
     off = ~np.eye(9, dtype=bool)
     expected = kernel(x, x)[off].mean() + kernel(y, y)[off].mean() - 2 * kernel(x, y).mean()
-    assert metric.compute().item() == pytest.approx(expected, rel=1e-3)
+    assert metric.compute()["kid"].item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_kid_of_many_is_torchmetrics():
+    """From 1000 images on, random subsets are compared."""
+    generator = torch.Generator().manual_seed(0)
+    real, fake = torch.rand(1100, 4, generator=generator), 1.2 * torch.rand(1100, 4, generator=generator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it warns that it keeps all features
+        metric = KernelInceptionDistance(feature=torch.nn.Identity())
+    metric.update(real, real=True)
+    metric.update(fake, real=False)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        expected = metric.compute()[0]
+    assert kernel_distance(fake, real).item() == pytest.approx(expected.item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("count", [2, 12, 70])
@@ -225,10 +238,10 @@ def test_jackknife_of_fid_and_kid(count, monkeypatch):
     assert all(value.shape == (count,) for value in values.values())
     for left_out in (0, count - 1):
         kept = [k for k in range(count) if k % 35 != left_out % 35]
-        for key, metric, tolerance in (("fid_without", FID(), 2e-3), ("kid_without", KID(), 1e-3)):
-            for features, is_real in ((real, True), (fake, False)):
-                metric.update(features[kept], real=is_real)
-            np.testing.assert_allclose(values[key][left_out], metric.compute(), rtol=tolerance, atol=1e-5)
+        metric = FeatureDistances()
+        metric.update(fake[kept], real[kept])
+        for key, value in metric.compute().items():
+            np.testing.assert_allclose(values[f"{key}_without"][left_out], value, rtol=1e-6)
 
 
 def test_standard_error_of_a_mean():
@@ -275,7 +288,7 @@ def test_inception_matches_the_torchscript(size, tmp_path, monkeypatch):
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, size[0] // 8, size[1] // 8, generator=generator)
     images = F.interpolate(coarse, size, mode="bilinear")
-    features = load_inception()(images)
+    features = load_inception(CPU)(images)
 
     path = find_weights()
     assert path.name == "default_1.pt"
@@ -318,8 +331,8 @@ def test_inception_reads_the_release_by_torchvision_names(tmp_path, monkeypatch,
 def test_folded_inception_is_the_same():
     """The layout and the normalisations within the convolutions change no more than rounding."""
     images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    plain, fast = (network(images) for network in (inception_module._read_model(find_weights()), load_inception()))
-    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in load_inception().modules())
+    plain, fast = (network(images) for network in (inception_module._read_model(find_weights()), load_inception(CPU)))
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in load_inception(CPU).modules())
     for key, value in plain.items():
         torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-5 * value.abs().max().item())
 
@@ -363,8 +376,8 @@ def test_reference_features_are_kept(tmp_path, monkeypatch):
 def test_inception_ignores_autocast():
     images = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        under_autocast = load_inception()(images)["pool"]
-    assert torch.equal(under_autocast, load_inception()(images)["pool"])
+        under_autocast = load_inception(CPU)(images)["pool"]
+    assert torch.equal(under_autocast, load_inception(CPU)(images)["pool"])
 
 
 @pytest.mark.parametrize("content", [b"not the weights", None])
@@ -374,7 +387,7 @@ def test_other_weights_are_refused(tmp_path, monkeypatch, uncached, content):
         file.write_bytes(content)
     monkeypatch.setenv("NLT_INCEPTION", str(file))
     with pytest.raises(UserError, match=r"default_1\.pt.*pip install"):
-        load_inception()
+        load_inception(CPU)
 
 
 def test_download_is_checked_and_cached(tmp_path, monkeypatch, no_weights):
@@ -415,7 +428,7 @@ def test_perceptual_metrics_end_to_end():
     """One batch of one, then a batch of two: against the definitions, on the network's own features."""
     batch = make_batch(3)
     metrics = ImageMetrics(perceptual=True)
-    network = load_inception()  # here, for torch.jit.load is deprecated
+    network = load_inception(CPU)  # here, for torch.jit.load is deprecated
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         metrics.update(*(x[:1] for x in batch))
@@ -478,11 +491,10 @@ def synchronise(rank: int, folder: str) -> None:
     torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2)
     metrics = ImageMetrics(perceptual=False)
     metrics.update(*(x[rank::2] for x in make_batch(5)))  # 3 and 2 images
-    fid = FID()
+    distances = FeatureDistances()
     for part in seeded_features().split(2)[rank::2]:  # 2 batches and 1
-        fid.update(part, real=True)
-        fid.update(part**2, real=False)
-    torch.save(metrics.compute() | {"fid": fid.compute()}, f"{folder}/{rank}.pt")
+        distances.update(part**2, part)
+    torch.save(metrics.compute() | distances.compute(), f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
 
 
@@ -490,8 +502,8 @@ def test_processes_synchronise(tmp_path: Path):
     mp.spawn(synchronise, (str(tmp_path),), nprocs=2)
     metrics = ImageMetrics(perceptual=False)
     metrics.update(*make_batch(5))
-    fid = frechet_distance(seeded_features() ** 2, seeded_features())
-    expected = metrics.compute() | {"fid": fid}
+    features = (seeded_features() ** 2).double(), seeded_features().double()
+    expected = metrics.compute() | {"fid": frechet_distance(*features), "kid": kernel_distance(*features)}
     for rank in range(2):
         values = torch.load(tmp_path / f"{rank}.pt")
         assert set(values) == set(expected)
