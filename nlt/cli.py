@@ -86,7 +86,9 @@ def _run(arguments: list[str]) -> int:
     elif options.command == "render":
         _render(options)
     elif options.command == "bench":
-        _bench(options)
+        from nlt.bench.run import Benchmark
+
+        Benchmark(**{name: value for name, value in vars(options).items() if name != "command"}).run()
     elif options.command == "select":
         from nlt.select.run import select
 
@@ -126,23 +128,6 @@ def _draw(directory: str | Path, megabytes: int | None = None) -> None:
     from nlt.stress.figures import stress_section
 
     draw(directory, megabytes, [stress_section])
-
-
-def _bench(options: argparse.Namespace) -> None:
-    from nlt.bench.run import Benchmark
-
-    benchmark = Benchmark(
-        out=options.out,
-        data=options.data,
-        scale=options.scale,
-        methods=options.methods,
-        changed=dict(options.set),
-        checkpoint=options.ckpt,
-        device=options.device,
-        seconds=options.seconds,
-        growth=["nlt_photons"] if options.growth == [] else options.growth,
-    )
-    benchmark.run()
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -280,10 +265,12 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scale", default="demo", help="config in configs/scale, by name or path (default: demo)")
     parser.add_argument("--methods", nargs="+", help="configs in configs/model (default: all)")
     parser.add_argument(
-        "--set", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
+        "--set", dest="changed", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
         help="override resolution, points, photons, width, depth, batch_size, workers or batch (frames at a time)",
     )  # fmt: skip
-    parser.add_argument("--ckpt", help="checkpoint of the only method (default: random weights)")
+    parser.add_argument(
+        "--ckpt", dest="checkpoint", metavar="CKPT", help="checkpoint of the only method (default: random weights)"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), help="cpu or cuda (default: cuda if available)")
     parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
     parser.add_argument(

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlt.data.render import SampleRenderer
+from nlt.rendering.renderer import sensor_to_world
 from nlt.scenes.camera import Camera
 
 
@@ -35,9 +36,7 @@ class Bare:
     def sample(self, state: Any, camera: Camera, split: str, seed: int) -> None:
         """Render the images and trace the photons of one sample of a split."""
         self.scene.set_state(state)
-        to_world = np.linalg.inv(camera.world_to_view.astype(float))
-        to_world[:3, 3] *= self.scene.description.units_per_metre
-        self.view["to_world"] = mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1, 1, 1]))
+        self.view["to_world"] = sensor_to_world(camera, self.scene.description.units_per_metre)
         self.view.update()
         references = [] if split == "train" else [self.spec.reference_spp] * 2
         for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, *references)):

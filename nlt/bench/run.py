@@ -9,7 +9,7 @@ import shutil
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -97,27 +97,27 @@ class Benchmark:
     def __init__(
         self,
         out: str | Path,
-        data: str = "demo",
-        scale: str = "demo",
-        methods: list[str] | None = None,
-        changed: Mapping[str, str] | None = None,
-        checkpoint: str | None = None,
-        device: str | None = None,
-        seconds: float = 20.0,
-        growth: Sequence[str] | None = None,
+        data: str,
+        scale: str,
+        methods: list[str] | None,
+        changed: Iterable[tuple[str, str]],
+        checkpoint: str | None,
+        device: str | None,
+        seconds: float,
+        growth: list[str] | None,
     ) -> None:
-        """Check the arguments.
+        """Check the arguments, which are the options of `nlt bench`.
 
         Args:
             out: the directory of the results.
             data: a config in configs/data, by name or path.
             scale: a config in configs/scale.
             methods: configs in configs/model; None for all except the ablation's.
-            changed: settings, out of `Sizes`, that override the configs'.
+            changed: names and values of settings, out of `Sizes`, that override the configs'.
             checkpoint: weights of the only method; None for random weights.
             device: cpu or cuda; None for cuda where there is one.
             seconds: time limit of a measurement.
-            growth: methods whose cost is measured over every factor of `GRID` that affects them.
+            growth: methods whose cost is measured over every factor of `GRID` that affects them; [] for nlt_photons.
 
         Raises:
             UserError: a config, method or setting is unknown, there is no such device, or the checkpoint is another
@@ -125,7 +125,8 @@ class Benchmark:
         """
         if device == "cuda" and not torch.cuda.is_available():
             raise UserError("--device: cuda: this machine has none; use --device cpu")
-        self.out, self.seconds, self.growth, self.checkpoint = Path(out), seconds, growth or [], checkpoint
+        self.out, self.seconds, self.checkpoint = Path(out), seconds, checkpoint
+        self.growth = ["nlt_photons"] if growth == [] else growth or []
         self.device = torch.device(device) if device else default_device()
         self.work = self.out / ".bench"
         self.done: dict[Part, dict[str, Any]] = {}
@@ -138,11 +139,11 @@ class Benchmark:
             for name in names:
                 if name not in known:
                     raise UserError(f"{option}: no method {name!r} in configs/model; known are {', '.join(known)}")
-        if checkpoint and (len(self.methods) != 1 or growth):
+        if checkpoint and (len(self.methods) != 1 or self.growth):
             raise UserError("--ckpt: holds one method; name only that one with --methods, without --growth")
         given = {**vars(self.spec), **self.config.get("model", {}).get("init_args", {}), **self.config["data"]}
         given = {name: value for name, value in given.items() if name in Sizes.model_fields}
-        given |= {name: int(text) if text.isdecimal() else text for name, text in (changed or {}).items()}
+        given |= {name: int(text) if text.isdecimal() else text for name, text in changed}
         self.settings: dict[str, int] = parse(Sizes, given, "--set").model_dump()
         self.spec = self._sized(self.settings, 1)
         self._renderer = cache(lambda scene: SampleRenderer(self.spec, scene))

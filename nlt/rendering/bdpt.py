@@ -117,7 +117,7 @@ class BDPT(mi.SamplingIntegrator):
         return radiance, hit, []
 
     def trace(self, scene: Any, sampler: Any, ray: Any, camera: Pinhole | None, active: Any = True) -> tuple:
-        """Do the same as `sample`; with a camera, to which `ray` belongs, also connect light subpaths to the camera.
+        """Trace as `sample` does and, if the `camera` of `ray` is given, connect light subpaths to it.
 
         Returns:
             Radiance along `ray`, whether it is valid, and S - 1 splats (pixel, radiance) of every lane's light

@@ -104,14 +104,11 @@ class Renderer:
         return (total / spp).T.astype(np.float32)
 
     def _scalar_image(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
-        view_to_world = np.linalg.inv(camera.world_to_view.astype(float))
-        view_to_world[:3, 3] *= self.scene.description.units_per_metre
         sensor = mi.load_dict({
             "type": "perspective",
             "fov": camera.fov,
             "near_clip": 1e-4,
-            # Mitsuba's camera looks along +z like ours, but its x points left and its y up.
-            "to_world": mi.ScalarTransform4f(view_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+            "to_world": sensor_to_world(camera, self.scene.description.units_per_metre),
             "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
         })  # fmt: skip
         image = mi.render(self.scene.mi_scene, sensor=sensor, integrator=self.integrator, spp=spp, seed=mi.UInt32(seed))
@@ -258,6 +255,13 @@ class Renderer:
         }
         fixed = {"scene": self.scene.mi_scene, "masks": self.scene.masks, **self._room}
         return launch(self._photons[emitter], lanes, emitter=self.emitters[emitter], **fixed)
+
+
+def sensor_to_world(camera: Camera, units_per_metre: float) -> Any:
+    """Return the transform of Mitsuba's camera, which looks along +z like ours, but whose x points left and y up."""
+    view_to_world = np.linalg.inv(camera.world_to_view.astype(float))
+    view_to_world[:3, 3] *= units_per_metre
+    return mi.ScalarTransform4f(view_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
 def _ray(corner: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:

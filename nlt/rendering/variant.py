@@ -7,6 +7,7 @@ import functools
 import glob
 import logging
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -21,6 +22,10 @@ log = logging.getLogger(__name__)
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 _PROBE = "import mitsuba as mi; mi.set_variant({!r}); import drjit as dr; print(dr.sum(mi.Float([1, 2])))"
 _LIBRARY = "DRJIT_LIBLLVM_PATH"
+_LIBRARIES = (
+    "/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*",
+    "/opt/homebrew/opt/llvm/lib/libLLVM*.dylib",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,13 +55,18 @@ def choose_variant() -> Variant:
     Raises:
         UserError: `NLT_VARIANT` names no variant.
     """
-    if "NLT_VARIANT" in os.environ:
-        name = os.environ["NLT_VARIANT"]
+    if name := os.environ.get("NLT_VARIANT"):
         if name not in VARIANTS:
             raise UserError(f"NLT_VARIANT: must be one of {', '.join(VARIANTS)} or unset, is {name!r}")
         if name.startswith("llvm") and (library := next(iter(_llvm_libraries()), None)):
             os.environ[_LIBRARY] = library
         return Variant(name, "set by NLT_VARIANT")
+    variant = _first_that_works()
+    os.environ["NLT_VARIANT"] = variant.name  # worker processes inherit this choice and do not probe again
+    return variant
+
+
+def _first_that_works() -> Variant:
     failed: list[str] = []
     for name in VARIANTS[:-1]:
         for library in _llvm_libraries() if name.startswith("llvm") else [None]:
@@ -64,35 +74,21 @@ def choose_variant() -> Variant:
                 if library:
                     os.environ[_LIBRARY] = library
                 reason = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
-                return _chosen(name, reason)
+                return Variant(name, reason)
         failed.append(f"{name} does not work here")
-    return _chosen(VARIANTS[-1], "; ".join(failed))
-
-
-def _chosen(name: str, reason: str) -> Variant:
-    # Worker processes inherit this choice and do not probe again.
-    os.environ["NLT_VARIANT"] = name
-    return Variant(name, reason)
+    return Variant(VARIANTS[-1], "; ".join(failed))
 
 
 def _llvm_libraries() -> list[str | None]:
     """Return candidate libraries, the newest first; None stands for Dr.Jit's own search."""
     if _LIBRARY in os.environ:
         return [None]
-    candidates = {
-        path
-        for pattern in ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*",
-                        "/opt/homebrew/opt/llvm/lib/libLLVM*.dylib")
-        for path in glob.glob(pattern)
-    }  # fmt: skip
-    version = lambda path: max((int(d) for d in _digits(os.path.basename(path)) + _digits(path)), default=0)
-    newest = {version(path): path for path in sorted(candidates)}
-    paths: list[str | None] = [newest[v] for v in sorted(newest, reverse=True) if v >= 16]
+    newest: dict[int, str] = {}  # by version
+    for path in sorted(path for pattern in _LIBRARIES for path in glob.glob(pattern)):
+        first_numbers = re.findall(r"\d+", os.path.basename(path))[:1] + re.findall(r"\d+", path)[:1]
+        newest[max(map(int, first_numbers), default=0)] = path
+    paths: list[str | None] = [newest[version] for version in sorted(newest, reverse=True) if version >= 16]
     return paths or ([None] if ctypes.util.find_library("LLVM") else [])
-
-
-def _digits(text: str) -> list[str]:
-    return "".join(c if c.isdigit() else " " for c in text).split()[:1]
 
 
 def _works(variant: str, library: str | None) -> bool:

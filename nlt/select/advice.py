@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,17 +56,17 @@ class Advice:
     subject: str
     verdict: str
     reason: str
-    methods: tuple[str, ...] = ()
+    methods: Sequence[str] = ()
 
 
-def measure_facts(spec: DatasetSpec, views: int = _VIEWS) -> list[Facts]:
+def measure_facts(spec: DatasetSpec) -> list[Facts]:
     """Measure every scene of a dataset in its experiment, at its resolution, in a process per scene.
 
     Raises:
         UserError: a scene does not load.
     """
     choose_variant()  # chosen once; the processes inherit it
-    spec = dataclasses.replace(spec, points=_MOST, photons=_MOST, train=0, val=0, test=views)
+    spec = dataclasses.replace(spec, points=_MOST, photons=_MOST, train=0, val=0, test=_VIEWS)
     return [Process(_facts, spec, scene).result() for scene in range(len(spec.scenes))]
 
 
@@ -114,10 +116,8 @@ def occupancy(pixels: np.ndarray, surface: np.ndarray, total: int) -> dict[int, 
 def enough(curve: dict[int, float]) -> int:
     """Return the count from which doubling covers less than 5 % more of the pixels, or the largest one tried."""
     counts = sorted(curve)
-    for n, half in zip(reversed(counts), reversed(counts[:-1]), strict=False):
-        if curve[n] - curve[half] >= _GAIN:
-            return n
-    return counts[0]
+    worthwhile = [n for half, n in itertools.pairwise(counts) if curve[n] - curve[half] >= _GAIN]
+    return max(worthwhile, default=counts[0])
 
 
 def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
@@ -131,17 +131,16 @@ def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
 
 
 def _transport(facts: list[Facts]) -> Advice:
-    lights = [name for fact in facts for name in fact.moving_lights]
-    moving = [name for fact in facts for name in fact.moving]
-    methods: tuple[str, ...]
+    lights = _some([name for fact in facts for name in fact.moving_lights])
+    moving = _some([name for fact in facts for name in fact.moving])
     if lights:
-        kind, methods = "photons", ("nlt_photons", "photon_splat")
-        reason = f"lights move or are removed: {_some(lights)}; photons say where light arrives in each state"
+        kind, methods = "photons", ["nlt_photons", "photon_splat"]
+        reason = f"lights move or are removed: {lights}; photons say where light arrives in each state"
     elif moving:
-        kind, methods = "points", ("nlt",)
-        reason = f"objects move or are removed: {_some(moving)}; no light does, so a network can learn where it arrives"
+        kind, methods = "points", ["nlt"]
+        reason = f"objects move or are removed: {moving}; no light does, so a network can learn where it arrives"
     else:
-        kind, methods = "none", ("feature_projection", "cnn")
+        kind, methods = "none", ["feature_projection", "cnn"]
         reason = "nothing moves: the light leaving a point is always the same, so its feature or the U-Net can store it"
     return Advice("light transport", f"{kind}: {', '.join(methods)}", reason, methods)
 
@@ -159,14 +158,11 @@ def _view_direction(facts: list[Facts]) -> Advice:
 def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
     best = max(enough(curve) for curve in curves)
     share = lambda n: float(np.mean([np.interp(np.log(n), np.log(list(c)), list(c.values())) for c in curves]))
-    verdict = f"{best:,} of {count:,}" if best < count else f"all {count:,}"
-    reason = (
-        f"{share(count):.0%} of the pixels with a surface hold one of {count:,}, {share(best):.0%} one of {best:,}; "
-        f"doubling that number would add less than {_GAIN:.0%}"
-    )
+    more = f"doubling that number would add less than {_GAIN:.0%}"
     if best == max(_COUNTS):
-        reason = reason.partition(";")[0] + "; larger numbers were not tried"
-    return Advice(what, verdict, reason)
+        more = "larger numbers were not tried"
+    held = f"{share(count):.0%} of the pixels with a surface hold one of {count:,}, {share(best):.0%} one of {best:,}"
+    return Advice(what, f"{best:,} of {count:,}" if best < count else f"all {count:,}", f"{held}; {more}")
 
 
 def _some(names: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""`nlt bench`: complete, consistent with itself, resumable; the plain path makes the same image."""
+"""`nlt bench` is complete, consistent and resumable, and the plain path is plain."""
 
 import json
 import re
@@ -31,7 +31,7 @@ SIZE = {"width": 3, "depth": 2, "num_scenes": SCENES, "num_points": POINTS}
 
 
 def test_the_plain_path_is_plain():
-    """float32 and contiguous, whatever the method was; its weights are its own."""
+    """The plain path is float32 and contiguous for any method, and does not share its weights."""
     method = NeuralLightTransport(photons=True, **SIZE)
     slow = plain(method.to(memory_format=torch.channels_last)).eval()
     seen = []
@@ -50,7 +50,7 @@ def test_the_plain_path_is_plain():
 
 
 class Recorder(Method):
-    """What a step is given."""
+    """Records the batches that its step is given."""
 
     inputs = ("traced", "depth")
     stages = ("gbuffer", "path_tracing")
@@ -65,13 +65,13 @@ class Recorder(Method):
 
 
 class Samples(list):
-    """A dataset of four scenes' samples, of which only their number counts."""
+    """Stands for a dataset of four scenes."""
 
     spec = SimpleNamespace(scenes=list("abcd"))
 
 
 def test_the_warm_up_sees_every_scene(monkeypatch):
-    """Else the first frame in a scene, which compiles its kernels, would be timed."""
+    """The first frame in a scene compiles kernels, so it must not be timed."""
     device, seen = torch.device("cpu"), []
     watch = clock.Clock(SimpleNamespace(dataset=Samples(range(4 * 16))), device)
     monkeypatch.setattr(watch, "_frame", lambda method, indices: seen.extend(indices) or {"synthesis": 0.0})
@@ -81,7 +81,7 @@ def test_the_warm_up_sees_every_scene(monkeypatch):
 
 
 def test_a_batch_of_frames(tiny, monkeypatch):
-    """Every frame of a batch is rendered and fed; methods take turns."""
+    """Every frame of a batch is rendered, and the methods take turns."""
     frames = Frames(LightTransportDataset(tiny.dataset, DatasetSpec(**DATASET), "test"))
     placed = []
     place = frames.place
@@ -101,7 +101,7 @@ def test_a_batch_of_frames(tiny, monkeypatch):
 
 @pytest.fixture(scope="module")
 def arguments(tmp_path_factory):
-    """Of a benchmark of seconds."""
+    """Yield the arguments of a benchmark that takes seconds."""
     folder = tmp_path_factory.mktemp("bench")
     data = write(folder / "data.yaml", {"data": {"dataset": DATASET, "batch_size": 2, "workers": 0}})
     scale = write(folder / "scale.yaml", SCALE)
@@ -117,7 +117,7 @@ def arguments(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def made(arguments, tmp_path_factory):
-    """The directory of a benchmark that was killed once, and what was measured after that."""
+    """Return the directory of a benchmark that was killed once, and the names of all measurements."""
     out = tmp_path_factory.mktemp("out")
     command = [*arguments, "--growth", "--set", "points=48", "--device", "cpu", "--out", str(out)]
     measured, original = [], bench.Benchmark.measure
@@ -194,7 +194,7 @@ def test_the_table_says_what_the_json_says(made):
 
 def test_what_would_take_too_long_is_skipped_and_said(arguments, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "GRID", {"width": (2, 4, 8)})
-    run = bench.Benchmark(tmp_path, arguments[2], arguments[4], ["cnn"], {}, None, "cpu", 1.0, ["cnn"])
+    run = bench.Benchmark(tmp_path, arguments[2], arguments[4], ["cnn"], [], None, "cpu", 1.0, ["cnn"])
     part = bench.Part("growth", "cnn", "width", 4)
     run.done = {bench.Part("growth", "cnn", "width", 2): {"time_per_frame_s": 0.3, "peak_memory_bytes": 8}}
     skipped = run.measure(part)["skipped"]
@@ -238,7 +238,7 @@ def test_another_methods_checkpoint(arguments, checkpoint, tmp_path, capfd):
 
 def test_a_checkpoint_gives_weights_and_size(arguments, checkpoint, tmp_path):
     run = bench.Benchmark(
-        tmp_path, arguments[2], arguments[4], ["cnn"], {"width": "7"}, str(checkpoint), "cpu", 1.0, []
+        tmp_path, arguments[2], arguments[4], ["cnn"], [("width", "7")], str(checkpoint), "cpu", 1.0, None
     )
     saved = torch.load(checkpoint, weights_only=True)
     assert run.settings["width"] == saved["architecture"]["width"] == 2
