@@ -21,7 +21,7 @@ SPP, SIZE, VIEWS, RENDERS = CODE["SPP"], 16, 3, 40
 
 
 def made_up(spread, seed, shift=0.0):
-    """Images whose pixels have mean 1 and, for one sample, a variance of `spread` squared."""
+    """Return images whose pixels have mean 1 and, for one sample, a variance of `spread` squared."""
     noise = np.random.default_rng(seed).normal(0, spread / np.sqrt(SPP), (VIEWS, RENDERS, 3, SIZE, SIZE))
     return 1 + shift + noise
 
@@ -46,7 +46,7 @@ def test_figures():
 
 
 def test_a_firefly_shows():
-    """One pixel makes the variance: the interval is wide, and the displayed variance hardly notices."""
+    """If one pixel makes up the variance, the interval is wide, but the displayed variance hardly changes."""
     images = {"path": made_up(1.0, 0), "bdpt": made_up(1.0, 1)}
     images["path"][1, 7, :, 3, 4] += 300
     row = figures(images)

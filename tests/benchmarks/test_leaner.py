@@ -20,7 +20,7 @@ MSE = {"tiny": 0.04, "small": 0.02, "medium": 0.01, "large": 0.01, "paper": 0.01
 
 @pytest.fixture
 def results(tmp_path):
-    """nlt_photons as in `MSE`, cnn the same in all sizes, but for 2 % of noise."""
+    """Return results with 2 % of noise: nlt_photons as in `MSE`, and cnn equal in all sizes."""
     rows = {}
     for k, (size, mse) in enumerate(MSE.items()):
         rows[f"nlt_photons@{size}"] = {"time_per_frame_s": 0.01 * 2**k, "mse": mse, "mssim": 0.8 - mse}
@@ -54,7 +54,7 @@ def test_one_seed_says_nothing_of_noise(tmp_path):
 
 
 def test_sizes_are_curves(results):
-    """A line for each method, the fastest first."""
+    """The sizes of a method make one curve, from the fastest on."""
     assert curves(results) == {
         "Ours (w/ photons), variants": [f"nlt_photons@{size}" for size in MSE],
         "CNN only, variants": [f"cnn@{size}" for size in MSE],

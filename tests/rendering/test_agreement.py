@@ -1,4 +1,4 @@
-"""Photons against Mitsuba's irradiancemeter, the G-buffer against its AOVs, `noisy` against the reference."""
+"""Photons agree with Mitsuba's irradiancemeter, the G-buffer with its AOVs, and `noisy` with the reference."""
 
 import mitsuba as mi
 import numpy as np
@@ -29,7 +29,7 @@ FLOOR = ([0, 0, 0.2], 0.2, [0, 1, 0], [-0.3, 0, 0])
 
 
 def irradiancemeter(folder, patch, depth):
-    """Mitsuba's irradiance of a patch, a millimetre in front of its surface: 8 estimates (8, 3)."""
+    """Return 8 estimates (8, 3) of a patch's irradiance by Mitsuba, a millimetre in front of its surface."""
     centre, half, normal, _ = (np.array(part, float) for part in patch)
     place = mi.ScalarTransform4f().look_at(centre + 1e-3 * normal, centre + normal, [0, 0.1, 1]).scale(float(half))
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
@@ -44,13 +44,13 @@ def irradiancemeter(folder, patch, depth):
 
 
 def compatible(ours, theirs):
-    """The least p-value of Welch's test, colour by colour, times their number."""
+    """Return the Bonferroni-corrected p-value of Welch's test on each colour."""
     return 3 * stats.ttest_ind(ours, theirs, equal_var=False).pvalue.min()
 
 
 @pytest.mark.parametrize("case", ["area light", "environment", "both"])
 def test_irradiance(tmp_path, case):
-    """What photons bring to a patch of a wall or of the floor beside the crate is its direct irradiance."""
+    """Photons give a patch of a wall, or of the floor beside the crate, its direct irradiance."""
     file = write_room(tmp_path, is_open=case != "area light", light=case != "environment")
     if case != "area light":
         mi.Bitmap(SKY).write(str(tmp_path / "sky.exr"))
@@ -76,7 +76,7 @@ def test_irradiance(tmp_path, case):
 
 
 def test_photon_splat(tmp_path):
-    """The irradiance that photons give the pixels of a room is the one that Mitsuba's direct radiance comes from."""
+    """The irradiance by photons explains Mitsuba's direct radiance in every pixel of a room."""
     description = load_description(str(write_room(tmp_path)))
     scene = Scene(description, "fixed_lights")
     renderer, camera = Renderer(scene), sample_view(description, 48, np.random.default_rng(1))
@@ -112,7 +112,7 @@ def test_photon_splat(tmp_path):
 
 
 def sensor_of(camera, units=1.0, **more):
-    """The camera, as Mitsuba's own."""
+    """Return Mitsuba's sensor for a camera."""
     to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
     to_world[:3, 3] *= units
     return mi.load_dict({
@@ -123,7 +123,7 @@ def sensor_of(camera, units=1.0, **more):
 
 
 def aovs(plain, camera, units):
-    """Mitsuba's AOVs at the pixel centres: depth along the axis in metres, normal, albedo; each (..., H, W)."""
+    """Return Mitsuba's AOVs at the pixel centres, each (..., H, W): depth along the axis in metres, normal, albedo."""
     sensor = sensor_of(camera, units, sampler={"type": "stratified", "sample_count": 1, "jitter": False})
     integrator = mi.load_dict({"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo"})
     values = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=1)), 2, 0).astype(float)
@@ -133,7 +133,7 @@ def aovs(plain, camera, units):
 
 
 def meets_mask(plain, camera, units):
-    """(H, W) bool: the first surface at the pixel's centre is a mask, on which Mitsuba's AOVs stop."""
+    """Return (H, W) bool: whether the first surface at the pixel's centre is a mask, where Mitsuba's AOVs stop."""
     flag = mi.BSDFFlags
 
     def of_mask(ray):
@@ -186,7 +186,7 @@ def test_gbuffer_of_the_living_room():
 
 
 def check_emission(renderer, plain, camera):
-    """Emission is what the path tracer sees before any bounce, with 4 x 4 rays' precision where a pixel has an edge."""
+    """Emission is what the path tracer sees before any bounce, up to the precision of 4 x 4 rays at edges."""
     spp, least = 1024, 1e-6
     integrator = mi.load_dict({"type": "path", "max_depth": 1})
     image = mi.render(plain, sensor=sensor_of(camera), integrator=integrator, spp=spp)
@@ -225,7 +225,7 @@ def test_emission_is_the_path_tracers_without_bounces(demo, experiment):
 
 @pytest.mark.parametrize("sky", ["envmap", "constant"])
 def test_emission_of_the_environment(tmp_path, sky):
-    """The sky past a floor, a crate and a lamp that faces down, seen from below and then from above."""
+    """Emission holds the sky and a lamp that faces down, seen from below and then from above."""
     file = write_room(tmp_path, is_open=True)
     mi.Bitmap(np.repeat(np.repeat(SKY, 8, 0), 8, 1) + 0.1).write(str(tmp_path / "sky.exr"))
     value = {
@@ -245,7 +245,7 @@ def test_emission_of_the_environment(tmp_path, sky):
 
 
 def test_noisy_and_input_have_the_references_expectation():
-    """Over many samples, each with its own seeds, state and view: no pixel's residual has a mean, none are related."""
+    """Over many samples, the residuals of all pixels have mean 0 and are uncorrelated."""
     spec = DatasetSpec(["living_room"], resolution=8, test=120, points=1, photons=1, reference_spp=16)
     render = SampleRenderer(spec, 0)
     samples = [render.sample("test", k) for k in range(spec.test)]

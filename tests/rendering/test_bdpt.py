@@ -1,4 +1,4 @@
-"""The bidirectional teacher against Mitsuba's path tracer and against a furnace, by statistical tests."""
+"""The bidirectional integrator agrees with Mitsuba's path tracer and with a furnace, by statistical tests."""
 
 from types import SimpleNamespace
 
@@ -68,20 +68,20 @@ def box(*size, at=(0, 0, 0)):
 
 
 def lamp(x, y, z, half, *radiance):
-    """Faces down."""
+    """Return a lamp that faces down."""
     place = mi.ScalarTransform4f().translate([x, y, z]).rotate([1, 0, 0], 90).scale(half)
     return {"type": "rectangle", "to_world": place, "bsdf": diffuse(0.3, 0.3, 0.3), "emitter": area(*radiance)}
 
 
 def room():
-    """Diffuse, closed; the crate's shading normals are far from its faces'."""
+    """Return a closed diffuse room with a crate whose shading normals are far from its faces' normals."""
     walls, crate = mesh(box(2, 2, 2), diffuse(0.7, 0.6, 0.5)), box(0.9, 1, 0.9, at=(-0.3, -0.5, -0.3))
     crate = mesh(crate, diffuse(0.3, 0.5, 0.8), smooth=True)
     return {"walls": walls, "crate": crate, "lamp": lamp(0.2, 0.98, 0, 0.3, 5, 4, 3)}
 
 
 def materials():
-    """A ball of every kind, coarse and shaded smoothly, under a lamp large enough for `path` to find it."""
+    """Return coarse, smoothly shaded balls of every material under a lamp that is large enough for `path`."""
     kinds = {
         "glass": {"type": "dielectric"},
         "frosted": {"type": "roughdielectric", "alpha": 0.3},
@@ -101,7 +101,7 @@ def materials():
 
 
 def chamber():
-    """Lit through a doorway alone: the lamp hangs in the next room."""
+    """Return a room that is lit only through a doorway, by a lamp in the next room."""
     white = diffuse(0.7, 0.7, 0.7)
     return {"walls": mesh(box(4, 2, 2), white), "lamp": lamp(-1.4, 0.9, 0.2, 0.3, 30, 27, 25),
             "wall": mesh(box(0.05, 2, 1.4, at=(-0.9, 0, -0.3)), white),
@@ -109,7 +109,7 @@ def chamber():
 
 
 def lantern():
-    """A lamp in a coarse globe of frosted glass: light's way out differs from the camera's way in."""
+    """Return a lamp in a coarse globe of frosted glass, where shading normals break the symmetry."""
     globe = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
     globe.apply_translation([-0.2, 0.1, -0.4])
     frosted = mesh(globe, {"type": "roughdielectric", "alpha": 0.5}, smooth=True)
@@ -118,7 +118,7 @@ def lantern():
 
 
 def sky():
-    """Through an opening, beside a lamp, and past the walls."""
+    """Return the balls between a wall and a floor under an environment map."""
     spots = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32) ** 4 * 4
     parts = materials()
     parts["walls"] = mesh(box(0.2, 2, 2, at=(-1.1, 0, 0)), diffuse(0.7, 0.6, 0.5))
@@ -127,7 +127,7 @@ def sky():
 
 
 def points():
-    """Emitters that no walk can meet."""
+    """Return a room with emitters that no path can hit."""
     aim = mi.ScalarTransform4f().look_at(origin=[-0.6, 0.8, 0.6], target=[0, -1, 0], up=[0, 0, 1])
     parts = room() | {"walls": mesh(box(2, 0.2, 2, at=(0, -1.1, 0)), diffuse(0.7, 0.6, 0.5))}
     return parts | {
@@ -138,7 +138,7 @@ def points():
 
 
 def furnace():
-    """A closed box that emits 1 and reflects half, everywhere."""
+    """Return a closed box that emits 1 and reflects half everywhere."""
     walls = box(2, 2, 2)
     walls.invert()
     return {"walls": mesh(walls, {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}, area(1, 1, 1))}
@@ -154,14 +154,14 @@ VIEW = Camera.look_at(np.array([0.3, 0.1, 0.9]), np.array([-0.2, -0.3, -1]), np.
 
 
 def images(renderer, first_seed, camera=VIEW):
-    """(SEEDS, values): radiance, means of blocks."""
+    """Return the mean radiance of blocks of pixels, (SEEDS, values)."""
     seeds = range(first_seed, first_seed + SEEDS)
     stack = np.stack([renderer.radiance(camera, SPP, seed) for seed in seeds]).astype(float)
     return stack.reshape(SEEDS, 3, SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK).mean((3, 5)).reshape(SEEDS, -1)
 
 
 def agreement(ours, theirs):
-    """The p-value of Welch's test of the worst block or of the mean, after Bonferroni's correction."""
+    """Return the Bonferroni-corrected p-value of Welch's test on the worst block or the mean."""
     ours, theirs = (np.concatenate([a, a.mean(1, keepdims=True)], 1) for a in (ours, theirs))
     black = (ours == 0).all(0) & (theirs == 0).all(0)
     return stats.ttest_ind(ours[:, ~black], theirs[:, ~black], equal_var=False).pvalue.min() * (~black).sum()
@@ -177,7 +177,7 @@ def test_agrees_with_path(parts):
 
 
 def test_agrees_without_connections_to_the_camera(monkeypatch):
-    """As a plain integrator, whose `sample` has no splats; with shorter walks from the light."""
+    """`bdpt` agrees with `path` also as a plain integrator without splats, and with shorter light subpaths."""
     monkeypatch.setattr(renderer_module, "_bidirectional", lambda image, **more: renderer_module._radiance(**more))
     ours = renderer_of(materials(), "bdpt")
     ours.integrator = mi.load_dict({"type": "bdpt", "light_vertices": 3})
@@ -199,7 +199,7 @@ def test_furnace(monkeypatch):
 
 
 def test_states_and_pixels(renderer, demo):
-    """Instances, in states one after the other by one frozen kernel; then only some of the pixels."""
+    """One frozen kernel renders moved instances in several states, and then only some of the pixels."""
     ours = Renderer(renderer.scene, "bdpt")
     camera = sample_view(demo, SIZE, np.random.default_rng(1))
     renderer.scene.set_state(rest_state(demo, "moving_lights"))
@@ -219,7 +219,7 @@ def test_states_and_pixels(renderer, demo):
 
 
 def test_choosing(tmp_path, monkeypatch, caplog):
-    """The dataset's word, else the scene's; where only `path` can run, the scene's gives way and the dataset's not."""
+    """The dataset overrules the scene; where only `path` can run, only the scene's choice gives way."""
     scene = str(write_yaml(tmp_path / "scene.yaml", teacher="bdpt"))
     of = lambda **more: SampleRenderer(DatasetSpec([scene], "fixed_lights", **more), 0).renderer.teacher
     assert (of(), of(teacher="path"), of(teacher="bdpt")) == ("bdpt", "path", "bdpt")

@@ -1,4 +1,4 @@
-"""Rendering against plain Mitsuba scenes, float64 geometry and analytic light, each by a statistical test."""
+"""Rendering agrees with plain Mitsuba scenes, float64 geometry and analytic light, by statistical tests."""
 
 import os
 import re
@@ -34,7 +34,7 @@ ALPHA = 1e-4  # of each test, after Bonferroni's correction
 
 
 def moments(plain, camera, spp, seed):
-    """Mitsuba's own mean and variance per path, XYZ (3, H, W), of the view of a plain scene."""
+    """Return the mean and the variance of a path in XYZ, (3, H, W), by Mitsuba alone in a plain scene."""
     to_world = np.linalg.inv(camera.world_to_view.astype(float)) @ np.diag([-1.0, -1, 1, 1])
     film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
     to_world = mi.ScalarTransform4f(to_world)
@@ -48,13 +48,13 @@ def moments(plain, camera, spp, seed):
 
 
 def samples_of(renderer, camera, spp, seeds, pixels=None):
-    """(seeds, 3, H, W) or (seeds, 3, n) XYZ of our renderer."""
+    """Return our renderer's images in XYZ, (seeds, 3, H, W) or (seeds, 3, n)."""
     images = np.stack([renderer.radiance(camera, spp, seed, pixels) for seed in seeds]).astype(float)
     return np.einsum("xc,nc...->nx...", XYZ, images)
 
 
 def p_value(samples, mean, variance):
-    """Of the worst of all entries and of their sum, that the samples' mean is `mean`, itself of that variance."""
+    """Return the p-value of the samples' mean being `mean` (known with `variance`), in the worst entry and the sum."""
     count = len(samples)
     ours, theirs = samples.var(0, ddof=1) / count, variance
     error = samples.mean(0) - mean
@@ -66,7 +66,7 @@ def p_value(samples, mean, variance):
 
 
 def away(experiment, demo):
-    """A state with the objects at their boxes' ends, the sofa, the lamp and the picture gone."""
+    """Return a state with the objects at the ends of their boxes and without sofa, lamp and picture."""
     movables = demo.movables(experiment)
     present = np.array([m.name not in ("sofa", "lamp", "picture") for m in movables])
     translation = np.stack([m.box[k % 2] for k, m in enumerate(movables)]) * present[:, None]
@@ -77,7 +77,7 @@ def away(experiment, demo):
 
 
 def check_states(renderer, demo, experiment):
-    """States, resolutions and spp one after the other, each against a scene built for it alone."""
+    """Each of several states, resolutions and spp in turn agrees with a scene that is built for it alone."""
     rng = np.random.default_rng(0)
     other = sample_state(demo, experiment, np.random.default_rng(11))
     cases = [(rest_state(demo, experiment), 12, 4), (away(experiment, demo), 16, 2), (other, 16, 3)]
@@ -103,7 +103,7 @@ def test_states_with_own_lights(demo):
 
 
 def test_two_scenes_at_once(renderer, demo):
-    """Moving one scene's objects leaves another scene alone, and each keeps its own kernels."""
+    """Moving one scene's objects does not change another scene, and each keeps its own kernels."""
     second = Renderer(Scene(demo, "moving_lights"))
     camera = sample_view(demo, 12, np.random.default_rng(2))
     states = [rest_state(demo, "moving_lights"), away("moving_lights", demo)]
@@ -116,7 +116,7 @@ def test_two_scenes_at_once(renderer, demo):
 
 
 def test_loaded_emitter_that_moves(tmp_path):
-    """The light of an XML scene is moved and removed: photons leave from where it is, with its power, or not at all."""
+    """When the light of an XML scene is moved or removed, its photons and their power follow."""
     box = [[-0.5, -0.5, 0], [0.5, 0, 0]]
     file = write_room(tmp_path, objects={"lamp": {"shapes": ["lamp"], "box": box}})
     scene = Scene(load_description(str(file)), "fixed_lights")
@@ -134,7 +134,7 @@ def test_loaded_emitter_that_moves(tmp_path):
 
 @pytest.mark.parametrize("movable", ["window", "bulb"])
 def test_emitter_that_moves(tmp_path, movable):
-    """An emitting object is moved, removed, and put back."""
+    """Photons follow an emitting object that is moved, removed and put back."""
     shapes = {"window": ["window_panel"], "bulb": ["ceiling_lamp_panel", "ceiling_lamp_frame"]}[movable]
     objects = {movable: {"shapes": shapes, "box": [[-0.3, -0.3, 0], [0.3, 0, 0.3]]}}
     description = load_description(str(write_yaml(tmp_path / "scene.yaml", objects=objects)))
@@ -161,7 +161,7 @@ def test_emitter_that_moves(tmp_path, movable):
 
 
 def test_textured_light(tmp_path):
-    """A light whose radiance is a texture of one colour is that of the plain light: images and photons."""
+    """A light with a texture of one colour gives the images and photons of the plain light."""
     plain = write_room(tmp_path / "plain")
     file = write_room(tmp_path / "textured")
     colour = np.broadcast_to(np.float32(LIGHT["radiance"]), (4, 4, 3))
@@ -187,7 +187,7 @@ def test_textured_light(tmp_path):
 
 
 def test_sparse_pixels(renderer, demo, monkeypatch):
-    """Asked-for pixels only, in the order asked for, with the full image's expectation."""
+    """Requested pixels come in the requested order and have the full image's expectation."""
     state = away("moving_lights", demo)
     renderer.scene.set_state(state)
     camera = sample_view(demo, 16, np.random.default_rng(4))
@@ -220,7 +220,7 @@ def test_sparse_pixels(renderer, demo, monkeypatch):
 
 
 def test_one_spp_is_unbiased(renderer, demo):
-    """The mean of many 1-spp images is the high-spp image: nothing is clamped."""
+    """The mean of many images of 1 spp is the image of many spp, because nothing is clamped."""
     state = rest_state(demo, "moving_lights")
     renderer.scene.set_state(state)
     camera = sample_view(demo, 12, np.random.default_rng(5))
@@ -245,7 +245,7 @@ def test_seeds(renderer, demo):
 
 
 def test_seeds_are_independent(renderer, demo):
-    """Neighbouring seeds, pixels and samples share no random numbers: residuals are uncorrelated."""
+    """The residuals of neighbouring seeds, pixels and samples are uncorrelated."""
     renderer.scene.set_state(rest_state(demo, "moving_lights"))
     camera = sample_view(demo, 12, np.random.default_rng(6))
     images = samples_of(renderer, camera, 1, range(400)).reshape(400, 3, -1)[:, 1]
@@ -262,7 +262,7 @@ def test_seeds_are_independent(renderer, demo):
 
 @pytest.mark.parametrize("experiment", ["fixed_lights", "moving_lights"])
 def test_gbuffer(experiment, demo):
-    """Depth, normals and constant albedos against float64 ray-triangle intersections, two states in turn."""
+    """Depth, normals and constant albedos agree with float64 ray-triangle intersections in two states."""
     renderer = Renderer(Scene(demo, experiment))
     for k, state in enumerate((rest_state(demo, experiment), away(experiment, demo))):
         renderer.scene.set_state(state)
@@ -312,7 +312,7 @@ def test_gbuffer(experiment, demo):
 
 
 def test_glass_transmits():
-    """The glass egg transmits where rays first meet a mesh of glass, float64, and nothing else in view does."""
+    """A pixel transmits exactly where its ray first hits the glass egg, by float64 intersections."""
     renderer, shapes = Renderer(Scene(load_description("egg"), "static")), builtin.egg().values()
     (glass,) = (shape.mesh.vertices for shape in shapes if shape.bsdf["type"] in GLASS)
     camera = Camera.look_at(glass.max(0) + np.array([0.5, 0.1, 0.5]), glass.mean(0), np.array([0, 1.0, 0]), 30, 16, 12)
@@ -325,7 +325,7 @@ def test_glass_transmits():
 
 
 def test_misses(tmp_path):
-    """Only a floor and a crate: what looks past them is zero, and the crate's depth is known."""
+    """Pixels that look past a floor and a crate are zero, and the crate's depth is known."""
     description = load_description(str(write_room(tmp_path, is_open=True)))
     scene = Scene(description, "fixed_lights")
     renderer = Renderer(scene)
@@ -351,7 +351,7 @@ def test_misses(tmp_path):
 
 
 def floor_irradiance(patch, size, centre, radiance, height):
-    """Float64 quadrature: mean irradiance of a floor patch (2, 2) from a rectangle that faces down."""
+    """Return the mean irradiance of a floor patch (2, 2) from a rectangle that faces down, by quadrature."""
     mid = lambda low, high, n: low + (np.arange(n) + 0.5) * (high - low) / n
     axes = lambda low, high: [mid(low[k], high[k], 30) for k in (0, 1)]
     grid = lambda low, high: np.stack(np.meshgrid(*axes(low, high)), -1).reshape(-1, 2)
@@ -362,7 +362,7 @@ def floor_irradiance(patch, size, centre, radiance, height):
 
 @pytest.fixture(scope="module")
 def open_room(tmp_path_factory):
-    """A renderer of a lamp above a bare floor, and the power that arrives on the floor, by quadrature."""
+    """Return a renderer of a lamp above a bare floor, and the power that arrives there by quadrature."""
     description = load_description(str(write_room(tmp_path_factory.mktemp("open"), is_open=True)))
     scene = Scene(description, "fixed_lights")
     scene.set_state(SceneState(np.zeros((1, 3), np.float32), np.array([False])))  # without the crate
@@ -371,7 +371,7 @@ def open_room(tmp_path_factory):
 
 
 def test_photons_in_an_open_room(open_room):
-    """Those that miss are dropped; hits and irradiance on the floor are known in closed form or by quadrature."""
+    """Photons that miss are dropped; hits and irradiance on the floor agree with closed forms and quadrature."""
     renderer, power = open_room
     count = 20_000
     photons = renderer.photons(count, 1)
@@ -392,7 +392,7 @@ def test_photons_in_an_open_room(open_room):
 
 
 def test_photon_flux_is_unbiased(open_room, monkeypatch):
-    """However few are asked for, and where the bound on casts comes first; counting naively is not."""
+    """The flux is unbiased for few photons and at the limit of casts, and naive counting is biased."""
     renderer, power = open_room
     share = power[0] / (np.pi * np.prod(LIGHT["size"]) * LIGHT["radiance"][0])
     assert 0.1 < share < 0.4
@@ -410,7 +410,7 @@ def test_photon_flux_is_unbiased(open_room, monkeypatch):
 
 
 def test_photons_of_the_sky(tmp_path):
-    """Into a room without a ceiling, under a constant sky: what arrives crosses the opening, none lands outside."""
+    """Photons of a constant sky arrive through the opening of a room without a ceiling, and none hits its outside."""
     sky, opening = np.array([3.0, 2.0, 1.0]), 4.0
     file = write_room(tmp_path, room=[[-1, 0, -1], [1, 2, 1]])
     walls = trimesh.load(tmp_path / "room.ply", process=False)
@@ -434,14 +434,14 @@ def test_photons_of_the_sky(tmp_path):
 
 
 def test_no_photon_arrives(tmp_path):
-    """The lamp's light never crosses a room that lies elsewhere: casting ends, and says so."""
+    """Casting ends with invalid photons if the lamp's light never crosses the room."""
     file = write_room(tmp_path, room=[[10, 0, 10], [11, 2, 11]])
     photons = Renderer(Scene(load_description(str(file)), "fixed_lights")).photons(5, 0)
     assert not photons["photon_valid"].any() and all((values == 0).all() for values in photons.values())
 
 
 def test_photons_of_two_emitters(demo):
-    """In proportion to power; first hits as by float64 ray-triangle intersection."""
+    """Photons come from emitters in proportion to power, and hit as float64 ray-triangle intersections do."""
     scene = Scene(demo, "fixed_lights")
     state = sample_state(demo, "fixed_lights", np.random.default_rng(2))
     scene.set_state(state)
@@ -486,7 +486,7 @@ def test_photons_of_the_moved_light(renderer, demo):
 
 
 def gradients(network, predict, targets):
-    """(n, parameters): of the mean squared error of what `predict` makes of the parameters against each target."""
+    """Return the gradients (n, parameters) of the mean squared error of `predict` against each target."""
 
     def loss(parameters, target):
         return ((predict(parameters) - target) ** 2).mean()
@@ -526,7 +526,7 @@ def test_lemma(renderer, demo, output):
 
 @pytest.fixture
 def probing(monkeypatch):
-    """choose_variant as in a fresh process; returns (what was probed, what works)."""
+    """Make choose_variant behave as in a new process; yield what was probed and what works."""
     monkeypatch.delenv("NLT_VARIANT", raising=False)
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     probed = []
@@ -574,13 +574,13 @@ def test_variant_unknown(probing, monkeypatch):
 
 
 def test_probe():
-    """The real probe: what runs here passes it, and a broken LLVM only kills the probe."""
+    """The variant that runs here passes the probe, and a broken LLVM only kills the probe."""
     assert not is_jit() or variant_module._works(mi.variant(), None)
     assert not variant_module._works("llvm_ad_rgb", "/dev/null")
 
 
 def test_scalar_agrees(renderer, demo):
-    """The scalar variant, in a process of its own, has the same expectation as the one that runs here."""
+    """The scalar variant has the same expectation as the variant that runs here."""
     code = (
         "import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()\n"
         "from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene\n"

@@ -47,7 +47,7 @@ pytest_plugins = ["training_fixtures"]
 
 @pytest.fixture(scope="module", params=sorted(BUILTINS))
 def built(request):
-    """(name, its yaml, {shape: BSDF flags}, shapes that emit), by Mitsuba alone; in scalar_rgb, which loads faster."""
+    """Yield (name, description, {shape: BSDF flags}, emitting shapes), by Mitsuba alone; scalar_rgb loads faster."""
     before = mi.variant()
     mi.set_variant("scalar_rgb")
     description = yaml.safe_load((CONFIGS / "scenes" / f"{request.param}.yaml").read_text())
@@ -59,7 +59,7 @@ def built(request):
 
 
 def test_what_varies(built):
-    """What moves, what of it emits, and what is specular, as Mitsuba's own flags say."""
+    """What moves, what emits and what is specular agrees with Mitsuba's own flags."""
     name, content, flags, emitting = built
     description = load_description(name)
     scenes = {experiment: Scene(description, experiment) for experiment in EXPERIMENTS[1:]}
@@ -103,7 +103,7 @@ def test_advice_of_several_scenes():
 
 
 def test_occupancy():
-    """Rarefaction against drawing subsets."""
+    """The expected occupancy agrees with the mean over subsets that are drawn."""
     rng = np.random.default_rng(0)
     pixels = rng.choice(33, 4096, p=rng.dirichlet(np.full(33, 0.3)))  # the last is for what is not seen
     surface = np.arange(32) % 4 > 0
@@ -116,7 +116,7 @@ def test_occupancy():
 
 
 def test_enough():
-    """Where a Poisson law saturates, found by search."""
+    """The saturation of a Poisson law agrees with a search over all counts."""
     for rate in (2e-4, 1e-3, 8e-3):
         curve = {n: 1 - np.exp(-rate * n) for n in advice._COUNTS}
         gains = [(n, curve[n] - curve[n // 2]) for n in advice._COUNTS[1:]]
@@ -152,7 +152,7 @@ def test_coverage_is_that_of_the_area_seen(variant):
 
 
 def test_thin():
-    """Flux sums to the same in expectation, and of every emitter come as many photons as are its share."""
+    """The expected flux stays the same, and each emitter keeps its share of the photons."""
     torch.manual_seed(0)
     kinds = torch.repeat_interleave(torch.arange(4), torch.tensor([50, 10, 30, 10]))
     batch = {"photon_flux": torch.rand(2, 100, 3), "photon_origin": kinds.float().view(1, -1, 1).expand(2, -1, 3)}
@@ -184,7 +184,7 @@ def test_paired_difference_of_one_seed():
 
 @pytest.mark.parametrize(("images", "seeds", "rest"), [(1.0, 0.3, 0.5), (0.1, 0.5, 1.0), (0.5, 0.0, 0.1)])
 def test_paired_difference_over_seeds(images, seeds, rest):
-    """The squared standard error is the variance of the mean, which repeating the experiment shows."""
+    """The squared standard error is the variance of the mean over repeated experiments."""
     rng = np.random.default_rng(1)
     count, n = 5, 12
     means, squares = [], []
@@ -218,7 +218,7 @@ def test_choice_against_brute_force():
 
 
 def test_ranking_against_brute_force():
-    """A candidate comes after all that beat it; the first are the Pareto front."""
+    """A candidate comes after all that beat it, and the Pareto front comes first."""
     rng = np.random.default_rng(3)
     for _ in range(30):
         points = {k: rng.integers(0, 5, 3) for k in range(8)}
@@ -238,11 +238,11 @@ STEPS, EPOCH, BUDGET_S = 12, 4, 600.0
 
 
 class Killed(BaseException):
-    """No error that the search knows of."""
+    """Stands for a kill: the search does not catch it."""
 
 
 class FakeTime:
-    """Seconds by counted steps: `per_step` for a candidate's width, `setup` for every training."""
+    """A clock that counts steps: a training takes `setup` seconds, and a step takes `per_step` times the width."""
 
     def __init__(self, patch, per_step=1.0, setup=2.0):
         self.seconds, self.per_step, self.setup, self.begun, self.die = 0.0, per_step, setup, [], math.inf
@@ -265,7 +265,7 @@ class FakeTime:
 
 
 class Here:
-    """In place of a process: what is patched holds in it, too."""
+    """Replaces `Process` and calls the function here, where patches apply."""
 
     def __init__(self, function, *arguments):
         self.result = lambda: function(*arguments)
@@ -273,7 +273,7 @@ class Here:
 
 @pytest.fixture
 def space(tiny, tmp_path, monkeypatch, one_thread):
-    """Its config file; the scene is not looked at again, and the clock is brief."""
+    """Write the config of a space; the scene is not measured, and few frames are timed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts()])
     monkeypatch.setattr(clock, "WARM_UP", 1)
@@ -364,7 +364,7 @@ def test_end_to_end(space, tiny, monkeypatch, capsys):
 
 @pytest.mark.parametrize("lights", [(), ("lamp",)])
 def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
-    """Where nothing moves, a CNN is among those trained longest, though it is the slowest and the worst."""
+    """Where nothing moves, a CNN is trained to the end, although it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
     score, race = trials.Trials.score, clock.Clock.time_interleaved
@@ -399,7 +399,7 @@ def newest(folder):
 
 @pytest.mark.parametrize("slower", [1.0, 3.0])
 def test_budget(space, monkeypatch, capsys, slower):
-    """Fewer candidates for less time; slower trainings exceed it by at most one."""
+    """Less time means fewer candidates, and slower trainings exceed the budget by at most one training."""
     fake = FakeTime(monkeypatch)
     budget = 100.0
     measured = search.Search._step_s
@@ -437,7 +437,7 @@ def test_mistakes(space, tmp_path, monkeypatch, capsys, change, said):
 
 
 def test_only_advice(tmp_path, monkeypatch, capsys):
-    """The command, on a scene that it looks at in a process of its own."""
+    """The command measures a scene in a separate process and trains nothing."""
     content = yaml.safe_load((CONFIGS / "select/demo.yaml").read_text())
     config = write(tmp_path / "advice.yaml", {**content, "data": "builtin_egg"})
     monkeypatch.chdir(tmp_path)
