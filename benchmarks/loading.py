@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import pydoc
 import statistics
 import tempfile
 import time
@@ -34,8 +33,8 @@ from nlt.data.sample import MATERIALS, POINT_FIELDS, Field
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name, write_manifest, write_shard
 from nlt.evaluation.provenance import origin, surroundings
+from nlt.models import factory
 from nlt.models.method import Method
-from nlt.models.module import RenderingModule
 from nlt.paths import find_config
 
 
@@ -69,10 +68,8 @@ def synthetic(spec: DatasetSpec, root: str) -> Path:
 
 def build(method: str, spec: DatasetSpec, width: int) -> Method:
     """Return a method with random weights."""
-    model: Any = read_configs([find_config("model", method)])["model"]
-    kind: Any = pydoc.locate(model["class_path"])
-    more = {"width": width, "num_scenes": len(spec.scenes), "num_points": spec.points}
-    return kind(**model.get("init_args", {}), **(more if issubclass(kind, RenderingModule) else {}))
+    file = find_config("model", method)
+    return factory.build(read_configs([file]), file, width=width, num_scenes=len(spec.scenes), num_points=spec.points)
 
 
 class Bare(Dataset):

@@ -15,7 +15,6 @@ import copy
 import hashlib
 import json
 import logging
-import pydoc
 import shlex
 import shutil
 import sys
@@ -42,6 +41,7 @@ from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
+from nlt.models import factory
 from nlt.models.module import Batch, RenderingModule
 from nlt.paths import find_config
 
@@ -93,9 +93,10 @@ def train(config: Row, spec: DatasetSpec, root: Path, size: int | None, seed: in
 
 
 def build(config: Row, spec: DatasetSpec, seed: int) -> RenderingModule:
-    model: Any = pydoc.locate(config["model"]["class_path"])
-    arguments = {"lr_decay": 1.0, "num_scenes": len(spec.scenes), "num_points": spec.points, "seed": seed}
-    return model(**{**config["model"].get("init_args", {}), **arguments})
+    sizes = {"num_scenes": len(spec.scenes), "num_points": spec.points}
+    module = factory.build(config, "the config", lr_decay=1.0, seed=seed, **sizes)
+    assert isinstance(module, RenderingModule)
+    return module
 
 
 def judge(module: RenderingModule, batches: list[Batch], snapshots: list[Row]) -> list[Row]:

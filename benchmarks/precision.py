@@ -20,23 +20,23 @@ from torch.utils.data import DataLoader
 from nlt.data.dataset import LightTransportDataset, identity_collate
 from nlt.data.spec import load_spec
 from nlt.evaluation.comparison import Comparison
+from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.trainings import Training
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.module import RenderingModule
-from nlt.models.policy import Policy
+from nlt.models.policy import Policy, accelerate
 
 POLICIES = {"float32": Policy(), "bfloat16": Policy(True, True), "int8": Policy(True, True, True)}
 KEYS = ("mse", "mssim")
 
 
-@torch.inference_mode()
 def judge(method: RenderingModule, dataset: LightTransportDataset, policy: Policy) -> dict[str, float]:
     """Return the means over the views of the metrics in KEYS."""
     metrics = ImageMetrics(perceptual=False)
-    with policy.applied(torch.device("cpu")):
-        for batch in DataLoader(dataset, batch_size=16, collate_fn=identity_collate):
-            metrics.update(method(batch), batch["reference_a"], batch["reference_b"], batch["exposure"])
+    batches = DataLoader(dataset, batch_size=16, collate_fn=identity_collate)
+    for _ in evaluate(accelerate(method, policy, torch.device("cpu")), batches, metrics):
+        pass  # `metrics` accumulates the batches
     values = metrics.compute()
     return {key: float(values[key]) for key in KEYS}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import pydoc
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,7 @@ from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
+from nlt.models.factory import build, method_class
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
 
@@ -100,8 +100,7 @@ class SearchSpace(Settings):
                 raise UserError(f"{scale}: data.dataset.{split}: must give at least 2 samples, gives fewer")
         parse(PositiveInt, read_configs([scale]).get("trainer", {}).get("max_steps"), scale, "trainer.max_steps")
         for method in self.methods:
-            kind = pydoc.locate(str(self._config(method, self.sizes[0])["model"].get("class_path")))
-            if not (isinstance(kind, type) and issubclass(kind, RenderingModule)):
+            if not issubclass(method_class(self._config(method, self.sizes[0]), file), RenderingModule):
                 raise UserError(f"{file}: methods: {method} is not trained; give a trained method")
 
     @cached_property
@@ -153,13 +152,8 @@ class SearchSpace(Settings):
 
     def build(self, candidate: Candidate) -> RenderingModule:
         """Return the candidate's untrained model."""
-        model = self.config(candidate)["model"]
-        kind: Any = pydoc.locate(model["class_path"])
         sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.points}
-        try:
-            module = kind(**{**model.get("init_args", {}), **sizes})
-        except TypeError as error:
-            raise UserError(f"{find_config('model', candidate.method)}: model.init_args: {error}") from None
+        module = build(self.config(candidate), find_config("model", candidate.method), **sizes)
         assert isinstance(module, RenderingModule)
         return module
 
