@@ -235,6 +235,8 @@ class Benchmark:
 
     def method(self, name: str, settings: Mapping[str, int]) -> Method:
         """Return a method with random weights or the checkpoint's."""
+        if method := build_if_untrained(name):
+            return method
         if self.checkpoint:
             return self._loaded(name)
         file = find_config("model", name)
