@@ -25,10 +25,10 @@ from scipy import stats
 
 from nlt.data.engines import Process
 from nlt.data.files import write_bytes
+from nlt.display import display
 from nlt.errors import UserError
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
-from nlt.metrics.display import display
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.report.figures import plt

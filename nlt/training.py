@@ -21,8 +21,8 @@ from PIL import Image
 
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
+from nlt.display import display
 from nlt.errors import UserError
-from nlt.metrics.display import display
 from nlt.models.factory import method_class, read_checkpoint, without_unused
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule

@@ -128,7 +128,7 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
     """Return the MSE between two reference halves as displayed, averaged over a scene's pilot views."""
     import torch  # here, because processes that render samples do not need it
 
-    from nlt.metrics.display import display
+    from nlt.display import display
 
     render = SampleRenderer(spec, scene)
     spp = min(PILOT_SPP, spec.reference_spp)

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from nlt.data.engines import Process
-from nlt.metrics.display import display
+from nlt.display import display
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.scenes.assembly import Scene

@@ -26,10 +26,10 @@ from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, points_crc, points_name, read_points
+from nlt.display import display
 from nlt.errors import UserError
 from nlt.evaluation.export import load_trained
 from nlt.evaluation.provenance import origin, surroundings
-from nlt.metrics.display import display
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera

@@ -12,7 +12,7 @@ from torchmetrics import MeanMetric, Metric, MetricCollection
 from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.utilities import dim_zero_cat
 
-from nlt.metrics.display import display, expose
+from nlt.display import display, expose
 from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.inception import STAGES, load_inception
 from nlt.metrics.jackknife import frechet_distance, kernel_distance

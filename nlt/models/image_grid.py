@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from nlt.metrics.display import display
+from nlt.display import display
 
 
 class ImageGrid(L.Callback):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from nlt.metrics.display import expose
+from nlt.display import expose
 
 
 def mse(prediction: Tensor, target: Tensor, exposure: Tensor) -> Tensor:

@@ -14,9 +14,9 @@ import torch
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
+from nlt.display import display
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import OK, Results
-from nlt.metrics.display import display
 from nlt.metrics.quantities import METRICS, heading
 from nlt.models.method import Batch
 from nlt.models.projection import average, visible_pixels

@@ -15,9 +15,9 @@ from torch import Tensor
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, read_points
+from nlt.display import expose
 from nlt.errors import UserError
 from nlt.evaluation.evaluate import evaluate
-from nlt.metrics.display import expose
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule

@@ -19,9 +19,9 @@ from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
 from nlt.data.store import points_name, read_points, write_shard
+from nlt.display import display
 from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.render import DEMO, ModelRenderer, _with_scene, render, write_video
-from nlt.metrics.display import display
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy, accelerate
 from nlt.rendering.renderer import Renderer

@@ -16,10 +16,10 @@ from torch.nn import functional as F
 from torchmetrics.image.fid import FrechetInceptionDistance
 from torchmetrics.image.kid import KernelInceptionDistance
 
+from nlt.display import display
 from nlt.errors import UserError
 from nlt.metrics import inception as inception_module
 from nlt.metrics import jackknife
-from nlt.metrics.display import display
 from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.image_metrics import SLOW, FeatureDistances, ImageMetrics, feature_l1, flip, unbiased_mse
 from nlt.metrics.inception import STAGES, Inception, find_weights, load_inception

@@ -17,10 +17,10 @@ from made_results import ODD, TROUBLED, make_results, make_troubled_results, pap
 from matplotlib import colormaps
 from playwright.sync_api import sync_playwright
 
+from nlt.display import display
 from nlt.evaluation.claims import write_claims
 from nlt.evaluation.paper import label, published
 from nlt.evaluation.results import load, write_manifest, write_rows
-from nlt.metrics.display import display
 from nlt.metrics.quantities import QUANTITIES
 from nlt.report import page as report_page
 from nlt.report.gallery import Shown, draw_failures

@@ -320,7 +320,7 @@ function imagesOf(view) {
   return found;
 }
 
-// ---- display transform, as in nlt/metrics/display.py ----
+// ---- display transform, as in nlt/display.py ----
 
 function display(x) {
   const linear = clamp(x, 0, 1);
