@@ -86,10 +86,10 @@ def parse(kind: type[T], content: Any, place: object, section: str = "") -> T:
     """
     try:
         # As JSON, because in its strict mode a list may become a tuple.
-        return TypeAdapter(kind).validate_json(json.dumps(content, default=str))
+        return TypeAdapter(kind).validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
         # An unknown key explains more than the missing one that it was meant to be.
-        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        first = min(error.errors(), key=lambda e: e["type"] not in _UNKNOWN_KEY)
         field = ".".join(str(part) for part in (section, *_fields(first["loc"])) if part != "")
         raise UserError(f"{place}: {field + ': ' if field else ''}{_problem(kind, first)}") from None
 
@@ -104,7 +104,7 @@ def _problem(kind: Any, error: Mapping[str, Any]) -> str:
     name, context, value = error["type"], error.get("ctx", {}), error["input"]
     if name == "missing":
         return "missing" if isinstance(error["loc"][-1], str) else "missing; the list is too short"
-    if name == "extra_forbidden":
+    if name in _UNKNOWN_KEY:
         return f"unknown key; known are {', '.join(_known_keys(kind, error['loc'][:-1]))}"
     if name in ("value_error", "assertion_error"):
         return str(context["error"])
@@ -113,10 +113,11 @@ def _problem(kind: Any, error: Mapping[str, Any]) -> str:
     return f"must be {_EXPECTED.get(name, lambda c: error['msg'].lower())(context)}, is {value!r}"
 
 
+_UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # in a model and in a dataclass
 _EXPECTED = {
     "int_type": lambda c: "a whole number",
     "int_from_float": lambda c: "a whole number",
-    "float_type": lambda c: "a number",
+    "float_type": lambda c: "a number such as 0.5 or 1.0e-4",
     "finite_number": lambda c: "a finite number",
     "bool_type": lambda c: "true or false",
     "string_type": lambda c: "a text",

@@ -16,7 +16,7 @@ from nlt.cli import _parser, main
 from nlt.config import merge
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
-from nlt.data.spec import DATA
+from nlt.data.spec import DataSection
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -163,7 +163,7 @@ def test_configs_of_training(refused, with_config, command, content, words):
 
 
 def test_known_keys_are_the_datamodules():
-    assert set(DATA) == set(inspect.signature(LightTransportDataModule).parameters)
+    assert set(DataSection.model_fields) == set(inspect.signature(LightTransportDataModule).parameters)
 
 
 def test_scale_without_a_model(refused, tiny):

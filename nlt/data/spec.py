@@ -5,26 +5,30 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
+from pydantic import AfterValidator, NonNegativeInt, PositiveInt
+from pydantic import Field as Bound
 
-from nlt.config import read_configs
+from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath, open_path
 from nlt.data.sample import FIELDS, SPLITS, Field
 from nlt.errors import UserError
-from nlt.scenes.description import EXPERIMENTS, TEACHERS, Experiment, SceneDescription, Teacher, load_description
+from nlt.scenes.description import Experiment, SceneDescription, Teacher, load_description
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 3  # version of the files on disk
-# Keys of a config file, and of its `data` section, which has the arguments of LightTransportDataModule.
-SECTIONS = ("data", "model", "trainer", "seed_everything")
-DATA = ("dataset", "root", "batch_size", "workers", "seed", "online", "train_images")
 _DRAWS = 1000  # attempts to find a state that no other split has
+
+
+def _not_empty(scenes: list[str]) -> list[str]:
+    if not scenes:
+        raise ValueError("must be a list of scene names; add a config from configs/data")
+    return scenes
 
 
 @dataclass
@@ -48,43 +52,32 @@ class DatasetSpec:
         seed: seed of everything random in the dataset.
         shard_size: samples per file.
         teacher: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
+
+    Raises:
+        UserError: a value has the wrong type or is out of bounds.
     """
 
-    scenes: list[str]
+    scenes: Annotated[list[str], AfterValidator(_not_empty)]
     experiment: Experiment = "moving_lights"
-    resolution: int = 64
-    train: int = 1000
-    val: int = 16
-    test: int = 64
-    points: int = 10_000
-    photons: int = 10_000
-    noisy_spp: int = 1
-    input_spp: int = 4
-    reference_spp: int = 64
-    reference_mse: float = 0.0
-    seed: int = 0
-    shard_size: int = 64
+    resolution: Annotated[int, Bound(ge=8)] = 64
+    train: NonNegativeInt = 1000
+    val: NonNegativeInt = 16
+    test: NonNegativeInt = 64
+    points: PositiveInt = 10_000
+    photons: PositiveInt = 10_000
+    noisy_spp: PositiveInt = 1
+    input_spp: PositiveInt = 4
+    reference_spp: PositiveInt = 64
+    reference_mse: Annotated[float, Bound(ge=0, allow_inf_nan=False)] = 0.0
+    seed: NonNegativeInt = 0
+    shard_size: PositiveInt = 64
     teacher: Literal["scene", Teacher] = "scene"
 
+    __pydantic_config__ = Settings.model_config  # in a config file, unknown keys are refused and nothing is converted
+
     def __post_init__(self) -> None:
-        at = "data.dataset"
-        if not isinstance(self.scenes, list) or not self.scenes:
-            raise UserError(f"{at}.scenes: must be a list of scene names, is {self.scenes!r}")
-        if self.experiment not in EXPERIMENTS:
-            raise UserError(f"{at}.experiment: must be one of {', '.join(EXPERIMENTS)}, is {self.experiment!r}")
-        if self.teacher not in ("scene", *TEACHERS):
-            raise UserError(f"{at}.teacher: must be one of scene, {', '.join(TEACHERS)}, is {self.teacher!r}")
-        least = {"resolution": 8, "seed": 0, **dict.fromkeys(SPLITS, 0)}
-        for field in dataclasses.fields(self):
-            if field.type != "int":
-                continue
-            value, low = getattr(self, field.name), least.get(field.name, 1)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise UserError(f"{at}.{field.name}: must be a whole number of at least {low}, is {value!r}")
-        mse = self.reference_mse
-        if isinstance(mse, bool) or not isinstance(mse, int | float) or not 0 <= mse < math.inf:
-            raise UserError(f"{at}.reference_mse: must be a number of at least 0, written as 1.0e-4, is {mse!r}")
-        self.reference_mse = float(mse)  # so that 0 and 0.0 give the same directory
+        for name, kind in get_type_hints(DatasetSpec, include_extras=True).items():
+            setattr(self, name, parse(kind, getattr(self, name), f"data.dataset.{name}"))
 
     @cached_property
     def descriptions(self) -> list[SceneDescription]:
@@ -193,6 +186,11 @@ class Shard:
     stop: int
 
     @property
+    def size(self) -> int:
+        """Number of samples."""
+        return self.stop - self.start
+
+    @property
     def name(self) -> str:
         """The file's name, relative to the dataset's directory."""
         return f"{self.split}/{self.scene:03d}-{self.start:07d}.safetensors"
@@ -208,24 +206,31 @@ def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], n
             raise UserError(f"{place}{key}: missing")
 
 
+class DataSection(Settings):
+    """The section `data` of a config file; generation reads three of the arguments of LightTransportDataModule."""
+
+    dataset: DatasetSpec
+    root: str = "datasets"
+    online: bool = False
+    batch_size: Any = None
+    workers: Any = None
+    seed: Any = None
+    train_images: Any = None
+
+
+class _Config(Settings):
+    data: DataSection
+    model: Any = None
+    trainer: Any = None
+    seed_everything: Any = None
+
+
 def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
     """Return the dataset in config files, without training samples that are rendered online, and the root of datasets.
 
     Raises:
         UserError: a file cannot be read, or has an unknown, missing or invalid key.
     """
-    where = " + ".join(files)
-    merged = read_configs(files)
-    data = merged.get("data")
-    if not isinstance(data, Mapping) or not isinstance(data.get("dataset"), Mapping):
-        raise UserError(f"{where}: data.dataset: missing; add a config from configs/data")
-    dataset = tuple(field.name for field in dataclasses.fields(DatasetSpec))
-    sections = (("", merged, SECTIONS), ("data.", data, DATA), ("data.dataset.", data["dataset"], dataset))
-    for section, content, known in sections:
-        check_keys(f"{where}: {section}", content, known)
-    if "scenes" not in data["dataset"]:
-        raise UserError(f"{where}: data.dataset.scenes: missing; add a config from configs/data")
-    spec, online = DatasetSpec(**data["dataset"]), data.get("online", False)
-    if not isinstance(online, bool):
-        raise UserError(f"{where}: data.online: must be true or false, is {online!r}")
-    return spec.without_train() if online else spec, open_path(data.get("root", "datasets"))
+    content = merge({"data": {"dataset": {"scenes": []}}}, read_configs(files))
+    data = parse(_Config, content, " + ".join(files)).data
+    return data.dataset.without_train() if data.online else data.dataset, open_path(data.root)
