@@ -12,10 +12,12 @@ import os
 import pickle
 import sys
 import time
-from collections.abc import Callable, Generator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Mapping
+from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from nlt.errors import UserError
 from nlt.waiting import as_the_user_said
@@ -33,10 +35,11 @@ class Died(Exception):
     """A process ended before its work was done."""
 
 
-class Engine(Protocol):
+class Engine(ABC):
     """Runs jobs, up to `workers` of them concurrently."""
 
     workers: int
+    _at_once = sys.maxsize  # how many jobs are started: a cluster has a queue of its own
 
     def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         """Run all jobs. A job that dies is retried once; if it dies again, the reason is added to `failures`.
@@ -44,7 +47,42 @@ class Engine(Protocol):
         Raises:
             UserError: `work` raised it.
         """
-        ...
+        waiting, retried = list(jobs), set()
+        running: dict[Any, Any] = {}  # jobs by future
+        try:
+            while waiting or running:
+                free = self._at_once - len(running)
+                if started := waiting[:free]:
+                    running.update(zip(self._start(work, started), started, strict=True))
+                    waiting = waiting[free:]
+                yield self._wait(running)
+                for future in [future for future in running if future.done()]:
+                    job = running.pop(future)
+                    try:
+                        _raise_user_error(future.result())
+                    except UserError:
+                        raise
+                    except Exception as error:  # Dask and submitit raise different classes for a lost worker
+                        if job in retried:
+                            failures[job] = " ".join(str(error).split())
+                        else:
+                            retried.add(job)
+                            waiting.append(job)
+        finally:
+            for future in running:
+                self._cancel(future)
+
+    @abstractmethod
+    def _start(self, work: Work, jobs: list[Any]) -> list[Any]:
+        """Start jobs and return their futures, which have `done`, `result` and `cancel`."""
+
+    def _wait(self, running: Iterable[Any]) -> int | None:
+        """Wait a moment and return the number of samples finished so far, or None."""
+        time.sleep(_POLL)
+        return None
+
+    def _cancel(self, future: Any) -> None:
+        future.cancel()
 
 
 def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], preload: tuple[str, ...] = ()) -> Engine:
@@ -75,96 +113,71 @@ def available_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class Local:
+class Local(Engine):
     """Runs jobs in processes on this machine."""
 
     def __init__(self, workers: int, preload: tuple[str, ...] = ()) -> None:
-        self.workers, self._preload = workers, preload
+        self.workers = self._at_once = workers
+        self._preload = preload
+        self._counters: dict[Any, Any] = {}
 
-    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
-        waiting, threads = list(jobs), max(1, available_cpus() // self.workers)
-        running: dict[Process, Any] = {}
-        counters: dict[Any, Any] = {}
-        retried = set()
-        try:
-            while waiting or running:
-                while waiting and len(running) < self.workers:
-                    job = waiting.pop(0)
-                    counters[job] = _counter()
-                    content = pickle.dumps((work, job))
-                    running[Process(_work, content, threads, counters[job], preload=self._preload)] = job
-                multiprocessing.connection.wait([process.sentinel for process in running], timeout=0.5)
-                yield sum(counter.value for counter in counters.values())
-                for process in [process for process in running if not process.is_alive()]:
-                    job = running.pop(process)
-                    try:
-                        process.result()
-                    except Died as error:
-                        if job in retried:
-                            failures[job] = str(error)
-                        else:
-                            retried.add(job)
-                            waiting.append(job)
-        finally:
-            for process in running:
-                process.kill()
+    def _start(self, work: Work, jobs: list[Any]) -> list[Process]:
+        self._counters |= {job: _counter() for job in jobs}
+        threads = max(1, available_cpus() // self.workers)
+        start = partial(Process, _work, preload=self._preload)
+        return [start(pickle.dumps((work, job)), threads, self._counters[job]) for job in jobs]
+
+    def _wait(self, running: Iterable[Process]) -> int:
+        multiprocessing.connection.wait([process.sentinel for process in running], timeout=_POLL / 2)
+        return sum(counter.value for counter in self._counters.values())
 
 
-class Dask:
+class Dask(Engine):
     """Runs jobs on a Dask cluster, which reruns the job of a lost worker on another one, up to its retry limit."""
 
     def __init__(self, address: str, workers: int | None, preload: tuple[str, ...] = ()) -> None:
-        self._address, self._preload = address, preload
-        with self._connect() as client:
-            self.workers = workers or max(1, sum(client.nthreads().values()))
-
-    def _connect(self) -> Any:
-        distributed = _extra("distributed")
+        self._preload = preload
         try:
-            return distributed.Client(self._address, timeout=_CONNECT)
+            self._client = _extra("distributed").Client(address, timeout=_CONNECT)
         except (OSError, ValueError) as error:
-            raise UserError(f"--scheduler: {self._address}: no Dask scheduler answers ({error})") from None
+            raise UserError(f"--scheduler: {address}: no Dask scheduler answers ({error})") from None
+        self.workers = workers or max(1, sum(self._client.nthreads().values()))
 
     def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
-        with self._connect() as client:
-            # Pickled here, so that Dask's workers do not import the modules that the work needs.
-            submit = lambda job: client.submit(_on_dask, pickle.dumps((work, job)), self._preload, pure=False)
-            yield from _wait({submit(job): job for job in jobs}, submit, failures)
+        with self._client:
+            yield from super().run(work, jobs, failures)
+
+    def _start(self, work: Work, jobs: list[Any]) -> list[Any]:
+        # Pickled here, so that Dask's workers do not import the modules that the work needs.
+        start = partial(self._client.submit, _on_dask, preload=self._preload, pure=False)
+        return [start(pickle.dumps((work, job))) for job in jobs]
 
 
-class Slurm:
+class Slurm(Engine):
     """Runs jobs in a Slurm array with logs in runs/slurm; `slurm-local` emulates the array on this machine."""
 
     def __init__(self, scheduler: str, workers: int, options: Mapping[str, str]) -> None:
         submitit = _extra("submitit")
         self.workers = workers
-        cluster = {"slurm": "slurm", "slurm-local": "local"}[scheduler]
+        cluster = scheduler.removeprefix("slurm-")  # submitit's names are slurm and local
         try:
             self._executor = submitit.AutoExecutor(Path("runs/slurm").absolute(), cluster=cluster)
         except RuntimeError as error:
             raise UserError(f"--scheduler slurm: {error}") from None
-        values: dict[str, Any] = {key: int(value) if value.isdigit() else value for key, value in options.items()}
-        known = self._executor._valid_parameters()
-        values = {key if key in known else f"slurm_{key}": value for key, value in values.items()}
+        values = {f"slurm_{key}": int(value) if value.isdigit() else value for key, value in options.items()}
         try:
             self._executor.update_parameters(**{"name": "nlt", "slurm_array_parallelism": workers} | values)
-        except (AssertionError, NameError) as error:
+        except NameError as error:
             raise UserError(f"--slurm: {str(error).splitlines()[0]}") from None
 
-    def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
-        futures = dict(zip(self._submit(work, jobs), jobs, strict=True))
-        try:
-            yield from _wait(futures, lambda job: self._submit(work, [job])[0], failures)
-        finally:
-            for task in futures:
-                if not task.done():
-                    task.cancel(check=False)
-
-    def _submit(self, work: Work, jobs: list[Any]) -> list[Any]:
+    def _start(self, work: Work, jobs: list[Any]) -> list[Any]:
         try:
             return list(self._executor.map_array(_on_slurm, [work] * len(jobs), jobs))
         except Exception as error:  # submitit has no exception class for a refusal by sbatch
             raise UserError(f"--scheduler slurm: {' '.join(str(error).split())}") from None
+
+    def _cancel(self, future: Any) -> None:
+        future.cancel(check=False)
 
 
 def _extra(name: str) -> Any:
@@ -174,51 +187,16 @@ def _extra(name: str) -> Any:
         raise UserError(f"--scheduler: {name} is not installed; run pip install 'nlt[cluster]'") from None
 
 
-def _wait(futures: dict[Any, Any], submit: Callable[[Any], Any], failures: dict[Any, str]) -> Ticks:
-    """Wait for all futures; each returns None or the message of a UserError, or raises because its worker died."""
-    retried = set()
-    while futures:
-        time.sleep(_POLL)
-        yield None
-        for future in [future for future in futures if future.done()]:
-            job = futures.pop(future)
-            try:
-                message = future.result()
-            except Exception as error:  # Dask and submitit raise different classes for a lost worker
-                if job in retried:
-                    failures[job] = " ".join(str(error).split())
-                else:
-                    retried.add(job)
-                    futures[submit(job)] = job
-                continue
-            if message:
-                raise UserError(message)
-
-
-def _on_dask(content: bytes, preload: tuple[str, ...]) -> str | None:
+def _on_dask(content: bytes, preload: tuple[str, ...]) -> UserError | None:
     from distributed import get_worker
 
-    _allow_children()
+    multiprocessing.current_process().daemon = False  # a daemon may not start processes
     threads = max(1, available_cpus() // get_worker().state.nthreads)
-    try:
-        Process(_work, content, threads, _counter(), preload=preload).result()
-    except UserError as error:
-        return str(error)
-    return None
+    return _result_or_user_error(Process(_work, content, threads, _counter(), preload=preload).result)
 
 
-def _allow_children() -> None:
-    # Multiprocessing forbids children to daemons, which Dask's workers and our processes are. Our children end if their
-    # parent dies.
-    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-
-
-def _on_slurm(work: Work, job: Any) -> str | None:
-    try:
-        work(job, available_cpus(), lambda _: None)
-    except UserError as error:
-        return str(error)
-    return None
+def _on_slurm(work: Work, job: Any) -> UserError | None:
+    return _result_or_user_error(work, job, available_cpus(), lambda _: None)
 
 
 def _counter() -> Any:
@@ -230,7 +208,7 @@ def _work(content: bytes, threads: int, counter: Any) -> None:
     work, job = pickle.loads(content)
     parent = multiprocessing.parent_process()
     assert parent is not None
-    _allow_children()
+    multiprocessing.current_process().daemon = False  # a daemon may not start processes, as data loaders do
     multiprocessing.set_start_method(None, force=True)  # otherwise data loaders inherit our slow start method
 
     def tick(samples: int) -> None:
@@ -241,20 +219,27 @@ def _work(content: bytes, threads: int, counter: Any) -> None:
     work(job, threads, tick)
 
 
-def _fork_context(preload: tuple[str, ...]) -> Any:
-    """Return a context whose processes are forked from a server that has only imported these modules."""
+def _result_or_user_error(function: Callable, *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except UserError as error:
+        return error
+
+
+def _raise_user_error(result: Any) -> Any:
+    if isinstance(result, UserError):
+        raise result
+    return result
+
+
+def _context(preload: tuple[str, ...]) -> Any:
+    """Return a context whose processes are spawned or, with `preload`, forked from a server with these modules only."""
+    if not preload:
+        return _CONTEXT
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(preload))
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # before Python 3.13, the server ignores sys.path
-    try:
-        with as_the_user_said():
-            forkserver.ensure_running()
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+    with as_the_user_said():
+        forkserver.ensure_running()
     return context
 
 
@@ -262,12 +247,16 @@ class Process:
     """Calls a function in a new process; the `preload` modules are imported once for all processes."""
 
     def __init__(self, function: Callable, *arguments: Any, preload: tuple[str, ...] = ()) -> None:
-        context: Any = _fork_context(preload) if preload else _CONTEXT
+        context = _context(preload)
         self._receive, send = context.Pipe(duplex=False)
-        self._process = context.Process(target=_send_result, args=(send, function, arguments), daemon=True)
+        self._process = context.Process(target=_send_result, args=(send, function, *arguments), daemon=True)
         self._process.start()
         send.close()
-        self.sentinel, self.is_alive, self.kill = self._process.sentinel, self._process.is_alive, self._process.kill
+        self.sentinel, self.cancel = self._process.sentinel, self._process.kill
+
+    def done(self) -> bool:
+        """Return whether the process has ended."""
+        return not self._process.is_alive()
 
     def result(self) -> Any:
         """Wait for the function and return its result.
@@ -282,13 +271,8 @@ class Process:
             self._process.join()
             raise Died(f"exit code {self._process.exitcode}") from None
         self._process.join()
-        if isinstance(result, UserError):
-            raise result
-        return result
+        return _raise_user_error(result)
 
 
-def _send_result(send: Any, function: Callable, arguments: tuple) -> None:
-    try:
-        send.send(function(*arguments))
-    except UserError as error:
-        send.send(error)
+def _send_result(send: Any, function: Callable, *arguments: Any) -> None:
+    send.send(_result_or_user_error(function, *arguments))
