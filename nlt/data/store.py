@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import zlib
-from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Collection
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -29,25 +27,30 @@ Points = dict[str, np.ndarray]  # a scene's point cloud, by field
 
 def write_shard(path: AnyPath, samples: list[dict[str, np.ndarray]]) -> None:
     """Write samples to one file, stacked field by field."""
-    arrays: dict[str, np.ndarray] = {}
-    for name in sorted(samples[0]):
-        stack = np.stack([sample[name] for sample in samples])
-        arrays[name] = stack
-        arrays[CRC + name] = np.array([zlib.crc32(row.tobytes()) for row in stack], np.uint32)
-    write_bytes(path, save(arrays))
+    arrays = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+    write_bytes(path, save(arrays | {CRC + name: checksums(stack) for name, stack in arrays.items()}))
+
+
+def checksums(stack: np.ndarray) -> np.ndarray:
+    """Return the CRC-32 of each sample's bytes in a stack, (n,) uint32."""
+    return np.array([zlib.crc32(sample.tobytes()) for sample in stack], np.uint32)
+
+
+def _open(path: AnyPath) -> dict[str, np.ndarray]:
+    with safe_open(local_copy(path), framework="pt") as file:  # copies nothing, unlike "numpy"
+        return {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
 
 
 class ShardReader:
     """Random access to samples through memory-mapped files. It works in threads and after a fork."""
 
     def __init__(self) -> None:
-        self._files: OrderedDict[AnyPath, dict[str, np.ndarray]] = OrderedDict()
-        self._pid, self._lock = os.getpid(), Lock()
+        self._open = lru_cache(_OPEN_FILES)(_open)
 
     def __reduce__(self) -> tuple[type[ShardReader], tuple[()]]:
         return ShardReader, ()
 
-    def read(self, path: AnyPath, row: int, fields: Iterable[str]) -> dict[str, np.ndarray]:
+    def read(self, path: AnyPath, row: int, fields: Collection[str]) -> dict[str, np.ndarray]:
         """Return fields of one sample of a shard as views of the mapped file.
 
         If the local copy of a remote file is damaged, it is downloaded once more.
@@ -55,19 +58,17 @@ class ShardReader:
         Raises:
             UserError: the shard is missing, truncated, or fails its CRC.
         """
-        fields = list(fields)
         try:
             return self._read(path, row, fields)
         except UserError:
             if isinstance(path, Path):
                 raise
-        with self._lock:
-            self._files.pop(path, None)
+        self._open.cache_clear()
         with suppress(FileNotFoundError):  # the next line reports it
             local_copy(path, fresh=True)
         return self._read(path, row, fields)
 
-    def _read(self, path: AnyPath, row: int, fields: list[str]) -> dict[str, np.ndarray]:
+    def _read(self, path: AnyPath, row: int, fields: Collection[str]) -> dict[str, np.ndarray]:
         advice = "delete the file and run `nlt generate` again"
         try:
             stacks = self._open(path)
@@ -82,18 +83,6 @@ class ShardReader:
             raise UserError(f"{path}: missing shard; run `nlt generate` again") from None
         except (SafetensorError, KeyError) as error:
             raise UserError(f"{path}: damaged shard ({error}); {advice}") from None
-
-    def _open(self, path: AnyPath) -> dict[str, np.ndarray]:
-        if self._pid != os.getpid():
-            self.__init__()  # type: ignore[misc]
-        with self._lock:
-            if path not in self._files:
-                with safe_open(local_copy(path), framework="pt") as file:  # copies nothing, unlike "numpy"
-                    self._files[path] = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
-                if len(self._files) > _OPEN_FILES:
-                    self._files.popitem(last=False)
-            self._files.move_to_end(path)
-            return self._files[path]
 
 
 def read_points(path: AnyPath) -> Points:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-import zlib
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -18,11 +18,19 @@ from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.sample import POINT_FIELDS, SPLITS, Field
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.data.store import CRC, MANIFEST, dataset_files, pilot_name, points_name, read_manifest, read_pilot, read_spec
+from nlt.data.store import (
+    CRC,
+    MANIFEST,
+    checksums,
+    dataset_files,
+    pilot_name,
+    points_name,
+    read_manifest,
+    read_pilot,
+    read_spec,
+)
 from nlt.errors import UserError
 from nlt.scenes.state import SceneState
-
-_RADIANCE = ("noisy", "noisy_input", "reference_a", "reference_b")
 
 
 def verify(place: str) -> None:
@@ -37,36 +45,31 @@ def verify(place: str) -> None:
     directory = open_path(place)
     spec, existing = read_spec(directory), list_files(directory)
     expected = dataset_files(spec)
-    findings = _check_manifest(directory, spec)
+    findings = list(_check_manifest(directory, spec, existing))
     findings += [f"{name}: missing" for name in expected if name not in existing]
     findings += [f"{name}: not part of the dataset" for name in sorted(existing - {MANIFEST, *expected})]
-    findings += _check_pilots(directory, spec, existing)
-    tasks: list[Shard | int] = [k for k in range(len(spec.scenes)) if points_name(k) in existing]
-    tasks += [shard for shard in spec.shards() if shard.name in existing]
-    states: dict[tuple[int, str], set[bytes]] = {}
+    files = [_File(points_name(k), POINT_FIELDS, 1) for k in range(len(spec.scenes))]
+    files += [_File(shard.name, spec.fields(shard.split), shard.size, shard) for shard in spec.shards()]
+    files = [file for file in files if file.name in existing]
+    states: dict[tuple[int, str], set[bytes]] = defaultdict(set)
     with ThreadPoolExecutor(available_cpus()) as pool:
-        check = lambda task: _check_shard(directory, spec, task)
-        for task, file in zip(tasks, tqdm(pool.map(check, tasks), "verifying", len(tasks), unit="file"), strict=True):
+        checks = pool.map(partial(_check_file, directory, spec.sizes), files)
+        for file, _ in zip(files, tqdm(checks, "verifying", len(files), unit="file"), strict=True):
             findings += file.findings
-            if isinstance(task, Shard):
-                states.setdefault((task.scene, task.split), set()).update(file.states)
+            if file.shard:
+                states[file.shard.scene, file.shard.split] |= file.states
     findings += _check_splits(spec, states)
-    print(*findings, f"{directory}: {len(tasks)} files read, {len(findings)} findings", sep="\n")
-    sys.stdout.flush()
+    print(*findings, f"{directory}: {len(files)} files read, {len(findings)} findings", sep="\n", flush=True)
     if findings:
         raise UserError(f"{directory}: {len(findings)} findings; delete the files named and run `nlt generate` again")
 
 
-def _check_manifest(directory: AnyPath, spec: DatasetSpec) -> list[str]:
+def _check_manifest(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -> Iterable[str]:
+    """Check the manifest and the pilot results that exist."""
     manifest, now = read_manifest(directory), spec.manifest
-    return [
-        f"{MANIFEST}: {key}: does not match the spec and the current scene files"
-        for key in ("format", "scenes", "exposure", "shards")
-        if manifest.get(key) != now[key]
-    ]
-
-
-def _check_pilots(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -> Iterable[str]:
+    for key in ("format", "scenes", "exposure", "shards"):
+        if manifest.get(key) != now[key]:
+            yield f"{MANIFEST}: {key}: does not match the spec and the current scene files"
     for scene in range(len(spec.scenes)):
         if spec.has_pilots and pilot_name(scene) in existing:
             try:
@@ -77,10 +80,12 @@ def _check_pilots(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -> 
 
 @dataclass
 class _File:
-    """A file's arrays and findings, and the states of its samples."""
+    """A file of points or samples: what it should hold, what is wrong with it, and the states of its samples."""
 
     name: str
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    fields: Mapping[str, Field]
+    count: int  # of samples
+    shard: Shard | None = None
     findings: list[str] = field(default_factory=list)
     states: set[bytes] = field(default_factory=set)
 
@@ -90,57 +95,46 @@ class _File:
             self.findings.append(f"{self.name}: {name}: sample {', '.join(map(str, np.flatnonzero(wrong)))}: {problem}")
 
 
-def _check_shard(directory: AnyPath, spec: DatasetSpec, task: Shard | int) -> _File:
-    """Check a shard or, if `task` is a scene's index, that scene's points."""
-    points = isinstance(task, int)
-    file = _File(points_name(task) if isinstance(task, int) else task.name)
+def _check_file(directory: AnyPath, sizes: dict[str, int], file: _File) -> None:
+    """Read a file and record its findings and states."""
     try:
-        file.arrays = load((directory / file.name).read_bytes())
+        arrays = load((directory / file.name).read_bytes())
     except (OSError, SafetensorError) as error:
         file.findings.append(f"{file.name}: cannot be read: {error}")
-        return file
-    count = 1 if isinstance(task, int) else task.stop - task.start
-    fields = POINT_FIELDS if isinstance(task, int) else spec.fields(task.split)
-    if _check_form(file, fields, count, spec.sizes) and not points:
-        _check_images(file)
-        rows = zip(file.arrays["translation"], file.arrays["present"], strict=True)
+        return
+    if _check_form(file, arrays, sizes) and file.shard:
+        _check_images(file, arrays)
+        rows = zip(arrays["translation"], arrays["present"], strict=True)
         file.states = {SceneState(moved, present).key for moved, present in rows}
-    return file
 
 
-def _check_form(file: _File, fields: Mapping[str, Field], count: int, sizes: dict[str, int]) -> bool:
+def _check_form(file: _File, arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> bool:
     """Check names, shapes, dtypes, CRCs and finite values; return whether every array has its declared form."""
-    declared = {name: ((count, *f.resolve(sizes)), f.dtype) for name, f in fields.items()}
-    declared |= {CRC + name: ((count,), "uint32") for name in fields}
-    actual = {name: (array.shape, array.dtype.name) for name, array in file.arrays.items()}
+    declared = {name: ((file.count, *f.resolve(sizes)), f.dtype) for name, f in file.fields.items()}
+    declared |= {CRC + name: ((file.count,), "uint32") for name in file.fields}
+    actual = {name: (array.shape, array.dtype.name) for name, array in arrays.items()}
     wrong = [name for name in {**declared, **actual} if declared.get(name) != actual.get(name)]
     file.findings += [
         f"{file.name}: {name}: is {actual.get(name, 'missing')}, not {declared.get(name, 'declared')}" for name in wrong
     ]
-    for name in [name for name in fields if name not in wrong and CRC + name not in wrong]:
-        array = file.arrays[name]
-        sums = np.array([zlib.crc32(row.tobytes()) for row in array], np.uint32)
-        file.report(name, sums != file.arrays[CRC + name], "fails its CRC")
-        file.report(name, ~np.isfinite(array.reshape(count, -1)).all(1), "not finite")
+    for name in [name for name in file.fields if name not in wrong and CRC + name not in wrong]:
+        file.report(name, checksums(arrays[name]) != arrays[CRC + name], "fails its CRC")
+        file.report(name, ~np.isfinite(arrays[name].reshape(file.count, -1)).all(1), "not finite")
     return not wrong
 
 
-def _check_images(file: _File) -> None:
+def _check_images(file: _File, arrays: Mapping[str, np.ndarray]) -> None:
     """Check that the images are not black or constant and that the camera sees a surface.
 
     With few samples per pixel, one noisy image may miss every light, so a sample fails only if both of its noisy images
     do.
     """
-    flat = {
-        name: (image == image[..., :1, :1]).reshape(len(image), -1).all(1)
-        for name, image in file.arrays.items()
-        if name in _RADIANCE
-    }
-    for name in sorted(flat.keys() - {"noisy", "noisy_input"}):
-        file.report(name, flat[name], "black or constant")
-    file.report("noisy, noisy_input", flat["noisy"] & flat["noisy_input"], "both black or constant")
-    depth = file.arrays["depth"]
-    file.report("depth", (depth == 0).reshape(len(depth), -1).all(1), "the camera sees no surface")
+    constant = {name: (array == array[..., :1, :1]).all((1, 2, 3)) for name, array in arrays.items() if array.ndim == 4}
+    for name in ("reference_a", "reference_b"):
+        if name in arrays:
+            file.report(name, constant[name], "black or constant")
+    file.report("noisy, noisy_input", constant["noisy"] & constant["noisy_input"], "both black or constant")
+    file.report("depth", (arrays["depth"] == 0).all((1, 2, 3)), "the camera sees no surface")
 
 
 def _check_splits(spec: DatasetSpec, states: Mapping[tuple[int, str], set[bytes]]) -> Iterable[str]:
@@ -148,5 +142,5 @@ def _check_splits(spec: DatasetSpec, states: Mapping[tuple[int, str], set[bytes]
         if not description.movables(spec.experiment):
             continue  # without movable objects there is only one state
         for first, second in combinations(SPLITS, 2):
-            if shared := states.get((scene, first), set()) & states.get((scene, second), set()):
+            if shared := states[scene, first] & states[scene, second]:
                 yield f"{description.name}: {len(shared)} states are in {first} and in {second}"
