@@ -99,7 +99,7 @@ def moving(spec: DatasetSpec, rounds: int) -> dict[str, float]:
     rest = {shape: np.array(parameters[key]).reshape(-1, 3) for shape, key in keys.items()}
     units = render.description.units_per_metre
     seconds: dict[str, list[float]] = {"instances": [], "meshes": []}
-    states = replace(spec, train=rounds, test=0).states(0)["train"]
+    states = [spec.state("train", 0, index, ()) for index in range(rounds)]
 
     def see(mi_scene: Any) -> None:
         np.array(mi_scene.ray_test(mi.Ray3f(mi.Point3f(0, 1, 0), mi.Vector3f(0, 0, 1))))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import os
 import shutil
 import sys
-import time
+import timeit
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,15 +22,7 @@ from nlt.data.files import AnyPath, open_path, remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.sample import SPLITS
 from nlt.data.spec import DatasetSpec, Shard
-from nlt.data.store import (
-    MANIFEST,
-    missing_files,
-    pilot_name,
-    points_name,
-    references,
-    write_manifest,
-    write_shard,
-)
+from nlt.data.store import MANIFEST, missing_files, pilot_name, points_name, references, write_manifest, write_shard
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 
@@ -144,16 +135,9 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
     return float(np.mean(errors))
 
 
-def _with_reference_spp(spec: DatasetSpec, spp: int) -> DatasetSpec:
-    """Return a copy of the spec whose references have a fixed number of samples per pixel."""
-    fixed = copy.copy(spec)  # unlike dataclasses.replace, this keeps the loaded scene descriptions
-    fixed.reference_spp, fixed.reference_mse = spp, 0.0
-    return fixed
-
-
 def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine) -> None:
     """Print the expected size and time; raise UserError if the disk is too small."""
-    samples = {split: sum(s.stop - s.start for s in shards if s.split == split) for split in SPLITS}
+    samples = {split: sum(s.size for s in shards if s.split == split) for split in SPLITS}
     size = sum(count * spec.nbytes(split) for split, count in samples.items())
     cost = f"{size / 1e9:.2f} GB"
     if isinstance(directory, Path):
@@ -165,7 +149,7 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
     if isinstance(engine, Local):  # other machines may be faster or slower
         try:
             mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))
-            train, evaluated = Process(_measure, _with_reference_spp(spec, mean)).result()
+            train, evaluated = Process(_measure, replace(spec, train=1, val=0, test=1, reference_spp=mean)).result()
         except Died as error:
             raise UserError(f"the renderer crashed in a trial run ({error})") from None
         seconds = (samples["train"] * train + (samples["val"] + samples["test"]) * evaluated) / engine.workers
@@ -176,9 +160,9 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
 def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
     """Divide the missing files into jobs."""
     jobs, shards = [], _shards(spec, missing)
+    most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))  # shards of a job
     for scene in range(len(spec.scenes)):
         in_scene = [shard for shard in shards if shard.scene == scene]
-        most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))
         points = points_name(scene) in missing
         # Shards of evaluated splits cost more, so they are spread over the jobs.
         count = -(-len(in_scene) // most)
@@ -188,7 +172,7 @@ def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
 
 
 def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) -> None:
-    remaining = lambda: sum(shard.stop - shard.start for shard in _shards(spec, missing_files(directory, spec)))
+    remaining = lambda: sum(shard.size for shard in _shards(spec, missing_files(directory, spec)))
     total, failures = remaining(), dict[Job, str]()
     jobs = plan(spec, missing_files(directory, spec), engine.workers)
     with (
@@ -208,8 +192,8 @@ def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int,
     """Run a job in its own process."""
     os.environ["NLT_VARIANT"] = variant  # every machine must use the same one
     directory = open_path(place)
-    chosen = _with_reference_spp(spec, references(directory, spec)[job.scene]["spp"])
-    fill(SampleRenderer(chosen, job.scene, threads), directory, job, tick)
+    spec.reference_spp = references(directory, spec)[job.scene]["spp"]  # this process has its own spec
+    fill(SampleRenderer(spec, job.scene, threads), directory, job, tick)
 
 
 def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:
@@ -219,7 +203,7 @@ def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[i
     for shard in job.shards:
         path = directory / shard.name
         if path.exists():  # another run has rendered it
-            tick(shard.stop - shard.start)
+            tick(shard.size)
         else:
             render_shard(render, path, shard, tick)
 
@@ -233,14 +217,7 @@ def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Call
     write_shard(path, samples)
 
 
-def _measure(spec: DatasetSpec) -> tuple[float, float]:
-    """Return the seconds of a training sample and of an evaluated sample, with one thread after a warm-up."""
-    render = SampleRenderer(spec, 0, 1)
-    seconds = []
-    for split in ("train", "test"):
-        for _ in range(2):
-            start = time.perf_counter()
-            render.sample(split, 0, rest=True)
-            last = time.perf_counter() - start
-        seconds.append(last)
-    return seconds[0], seconds[1]
+def _measure(spec: DatasetSpec) -> list[float]:
+    """Return the seconds of a training sample and of a test sample, with one thread after a warm-up."""
+    render = SampleRenderer(spec, 0, threads=1)
+    return [timeit.repeat(partial(render.sample, split, 0), number=1, repeat=2)[-1] for split in ("train", "test")]

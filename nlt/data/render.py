@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,7 +16,6 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import SceneDescription
 from nlt.scenes.pointcloud import sample_points
-from nlt.scenes.state import rest_state
 from nlt.scenes.views import Views
 
 _ATTEMPTS = 3
@@ -40,8 +38,7 @@ class SampleRenderer:
         self.scene = build(self.description, spec.experiment)
         self.renderer = Renderer(self.scene, spec.teacher)
         self.views = Views(self.scene)
-        self._states: dict[str, Any] | None = None
-        self._taken: set[bytes] = set()  # keys of the states in the evaluated splits
+        self._taken: dict[str, set[bytes]] = {}  # keys of the states that each split avoids
         if threads:
             dr.set_thread_count(threads)  # must not come earlier: see `use_variant`
 
@@ -52,29 +49,21 @@ class SampleRenderer:
         print(f"{self.description.name}: points lie on the {share:.1%} of the surface that can be seen", flush=True)
         return points
 
-    def place(self, split: str, index: int, rest: bool = False) -> Camera:
-        """Put the scene into a sample's state, or into the rest state, and return the sample's camera.
+    def place(self, split: str, index: int) -> Camera:
+        """Put the scene into a sample's state and return the sample's camera.
 
-        An index beyond the spec's count gives a further sample, in a state that val and test do not contain.
+        An index beyond the spec's count gives a further sample.
         """
         spec = self.spec
-        if rest:
-            state = rest_state(self.description, spec.experiment)
-        else:
-            if self._states is None:
-                self._states = spec.states(self.index)
-                self._taken = {state.key for name in ("val", "test") for state in self._states[name]}
-            listed = self._states[split]
-            state = listed[index] if index < len(listed) else spec.state(split, self.index, index, self._taken)
-        self.scene.set_state(state)
+        if split not in self._taken:
+            self._taken[split] = spec.taken(split, self.index)
+        self.scene.set_state(spec.state(split, self.index, index, self._taken[split]))
         rng = np.random.default_rng(spec.seeds(split, self.index, index).spawn(2)[1])
         return self.views.sample(spec.resolution, rng)
 
-    def sample(
-        self, split: str, index: int, rest: bool = False, only: Collection[str] | None = None
-    ) -> dict[str, np.ndarray]:
-        """Return one sample: all fields of its split, or those in `only`. `rest` takes the rest state, for timing."""
-        camera = self.place(split, index, rest)
+    def sample(self, split: str, index: int, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
+        """Return one sample: all fields of its split, or those in `only`."""
+        camera = self.place(split, index)
         fields = {name for name in self.spec.fields(split) if only is None or name in only}
         return self.view(camera, self.spec.seeds(split, self.index, index), fields)
 
@@ -84,14 +73,12 @@ class SampleRenderer:
         noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds.generate_state(5))
         sizes = spec.sizes | {"H": camera.height, "W": camera.width}
         fields = {name: field for name, field in FIELDS.items() if name in names}
-        moved = np.zeros((sizes["M"], 3), np.float32)
-        present = np.zeros(sizes["M"], bool)
-        moved[: len(state.present)], present[: len(state.present)] = state.translation, state.present
+        absent = sizes["M"] - len(state.present)  # another scene of the dataset has more movable objects
         sample: dict[str, np.ndarray] = {
             "camera_matrix": camera.matrix,
             "world_to_view": camera.world_to_view,
-            "translation": moved,
-            "present": present,
+            "translation": np.pad(state.translation, ((0, absent), (0, 0))),
+            "present": np.pad(state.present, (0, absent)),
         }
         images = {
             "noisy": (spec.noisy_spp, noisy),

@@ -151,17 +151,15 @@ class DatasetSpec:
         """Return the seeds of one sample."""
         return np.random.SeedSequence([self.seed, SPLITS.index(split), scene, index])
 
-    def states(self, scene: int) -> dict[str, list[SceneState]]:
-        """Return the states of a scene's samples by split. No state is in two splits, unless nothing can move."""
+    def taken(self, split: str, scene: int) -> set[bytes]:
+        """Return the keys of the states that a split avoids: train those of val and test, val those of test."""
         taken: set[bytes] = set()
-        states: dict[str, list[SceneState]] = {}
-        for split in reversed(SPLITS):
-            states[split] = [self.state(split, scene, index, taken) for index in range(self.count(split))]
-            taken |= {state.key for state in states[split]}
-        return states
+        for other in reversed(SPLITS[SPLITS.index(split) + 1 :]):
+            taken |= {self.state(other, scene, index, taken).key for index in range(self.count(other))}
+        return taken
 
     def state(self, split: str, scene: int, index: int, taken: Collection[bytes]) -> SceneState:
-        """Return the state of one sample, also beyond the spec's count, avoiding the states `taken` by other splits.
+        """Return the state of one sample, also beyond the spec's count, avoiding `taken`, unless nothing can move.
 
         Raises:
             UserError: no free state was found; the boxes of the scene's objects are too small.

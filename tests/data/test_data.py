@@ -1,5 +1,6 @@
 """Generated datasets: complete, of the declared form, the same bytes however often interrupted, strictly checked."""
 
+import dataclasses
 import json
 import shutil
 import threading
@@ -24,7 +25,7 @@ from nlt.scenes.camera import Camera
 
 @pytest.fixture
 def damaged(dataset, tmp_path):
-    """A copy to harm, under a root of its own."""
+    """A copy of the dataset that a test may damage."""
     return Path(shutil.copytree(dataset, tmp_path / dataset.name))
 
 
@@ -37,7 +38,7 @@ def samples_of(directory, split):
 
 
 def test_fields(dataset):
-    """Every array on disk is as FIELDS and POINT_FIELDS say."""
+    """Every array on disk has the shape and dtype that FIELDS and POINT_FIELDS give."""
     spec, reader = spec_of(), store.ShardReader()
     for shard in spec.shards():
         fields = {n: f for n, f in FIELDS.items() if shard.split != "train" or not f.reference_only}
@@ -87,30 +88,40 @@ def test_spec_refused(change):
         DatasetSpec(**{"scenes": ["living_room"], **SIZE, **change})
 
 
+def test_spec_is_written_as_ever():
+    """The name of a dataset's directory is a hash of these bytes."""
+    written = json.dumps(dataclasses.asdict(DatasetSpec(["living_room"], reference_mse=0)), sort_keys=True)
+    assert written == (
+        '{"experiment": "moving_lights", "input_spp": 4, "noisy_spp": 1, "photons": 10000, "points": 10000, '
+        '"reference_mse": 0.0, "reference_spp": 64, "resolution": 64, "scenes": ["living_room"], "seed": 0, '
+        '"shard_size": 64, "teacher": "scene", "test": 64, "train": 1000, "val": 16}'
+    )
+
+
 # ---- splits ---------------------------------------------------------------------------------------------
 
 
-def states_by_split(spec):
-    return {split: {s.key for s in states} for split, states in spec.states(0).items()}
+def states_of(spec):
+    taken = {split: spec.taken(split, 0) for split in SPLITS}
+    return {s: [spec.state(s, 0, k, taken[s]) for k in range(spec.count(s))] for s in SPLITS}
 
 
 def test_no_state_in_two_splits(tmp_path):
-    """Also where a fifth of all states is the same: one object, removed."""
+    """Splits share no state, even if a fifth of all draws give the same one: a single object, removed."""
     objects = {"rug": {"shapes": ["rug"], "box": [[-0.1, 0, 0], [0.1, 0, 0]]}}
     file = write_yaml(tmp_path / "scene.yaml", objects=objects)
     for spec in (spec_of(train=300, val=40, test=40), spec_of(str(file), experiment="fixed_lights", train=300, val=40)):
-        states = spec.states(0)
-        assert {k: len(v) for k, v in states.items()} == {s: spec.count(s) for s in SPLITS}
-        keys = states_by_split(spec)
+        states = states_of(spec)
+        keys = {split: {state.key for state in states[split]} for split in SPLITS}
         assert not (keys["train"] & keys["val"] | keys["train"] & keys["test"] | keys["val"] & keys["test"])
     assert any(not s.present.any() for split in states.values() for s in split), "nothing was forced"
 
 
 def test_too_few_states_refused(tmp_path):
-    """An object that can only be there or not has two states: not enough for three splits."""
+    """An object that can only be present or absent has two states, which are too few for three splits."""
     file = write_yaml(tmp_path / "scene.yaml", objects={"rug": {"shapes": ["rug"], "box": [[0, 0, 0], [0, 0, 0]]}})
     with pytest.raises(UserError, match=r"scene.yaml.*states"):
-        spec_of(str(file), experiment="fixed_lights", train=100, val=20, test=20).states(0)
+        states_of(spec_of(str(file), experiment="fixed_lights", train=100, val=20, test=20))
 
 
 # ---- damage ---------------------------------------------------------------------------------------------
@@ -228,7 +239,7 @@ def test_reads_only_what_is_asked_for(dataset, monkeypatch):
 
 @pytest.mark.parametrize(("workers", "batch_size"), [(0, 5), (2, 5), (0, 1)])
 def test_batches_hold_what_is_stored(dataset, workers, batch_size):
-    """Bit for bit, against the files read by safetensors and the formulas of a plain loop."""
+    """A batch equals, bit for bit, what safetensors reads and what plain formulas derive from it."""
     spec = spec_of()
     module = LightTransportDataModule(spec, str(dataset.parent), batch_size=batch_size, workers=workers)
     module.setup("fit")
@@ -331,7 +342,7 @@ def test_loader_errors(dataset):
 
 
 def test_two_scenes(tmp_path):
-    """Each scene has its index, its exposure and its points; a scene with fewer objects is padded."""
+    """Each scene has its own index, exposure and points; a scene with fewer movable objects is padded."""
     one = write_yaml(tmp_path / "one.yaml", name="one", exposure=2.0)
     objects = {"rug": {"shapes": ["rug"], "box": [[-0.1, 0, 0], [0.1, 0, 0]]}}
     two = write_yaml(tmp_path / "two.yaml", name="two", exposure=0.5, objects=objects)

@@ -152,7 +152,7 @@ def test_states_beyond_training(perturber):
     perturber.place(2, "objects_crowded", 0.95)
     assert perturber.scene.state.present.all()
     perturber.place(2)  # nothing of it stays
-    expected = perturber.render.spec.states(0)["test"][2]
+    expected = perturber.render.spec.state("test", 0, 2, ())
     assert perturber.scene.state.key == expected.key
 
 
