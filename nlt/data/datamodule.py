@@ -55,6 +55,7 @@ class LightTransportDataModule(L.LightningDataModule):
             )
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
         self.online, self.passes, self.train_images = online, 0, train_images
+        self.num_scenes, self.num_points = len(dataset.scenes), dataset.points  # training links them to the method
         self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
         self.points: list[int] = []
@@ -85,16 +86,6 @@ class LightTransportDataModule(L.LightningDataModule):
                 f"{self.directory}: its points differ from those of the checkpoint's embeddings, for example because "
                 "another NLT_VARIANT rendered it; give --data.root with the checkpoint's own dataset, or train again"
             )
-
-    @property
-    def num_scenes(self) -> int:
-        """Number of scenes in the dataset, each of which has its own embeddings."""
-        return len(self.spec.scenes)
-
-    @property
-    def num_points(self) -> int:
-        """Number of points per scene."""
-        return self.spec.points
 
     def setup(self, stage: str) -> None:
         """Check that the dataset exists and read its points.
@@ -160,6 +151,4 @@ class LightTransportDataModule(L.LightningDataModule):
         """Return a loader of the test samples in order."""
         return self._loader("test")
 
-    def predict_dataloader(self) -> DataLoader:
-        """Return a loader of the test samples in order."""
-        return self._loader("test")
+    predict_dataloader = test_dataloader

@@ -51,21 +51,13 @@ class SampleTensors:
             height, width = stored["noisy"].shape[-2:]
             camera = Camera(stored["camera_matrix"], stored["world_to_view"], width, height)
             sample["view_direction"] = torch.from_numpy(camera.view_directions())
-        sample |= {k: v for k, v in self._point_fields(scene, stored).items() if self.wants(k)}
+        if "present" in stored:
+            position, visible = place_points(self._points[scene], stored["translation"], stored["present"])
+            moved = {"point_position": torch.from_numpy(position), "point_visible": torch.from_numpy(visible)}
+            sample |= {k: v for k, v in (moved | self._static[scene]).items() if self.wants(k)}
         sample["scene"], sample["index"] = torch.tensor(scene), torch.tensor(index)
         sample["exposure"] = torch.tensor(self._spec.descriptions[scene].exposure, dtype=torch.float32)
         return sample
-
-    def _point_fields(self, scene: int, stored: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-        """Return the points, moved and hidden according to the sample's state (supplementary, Sec. Datasets)."""
-        if "present" not in stored:
-            return {}
-        position, visible = place_points(self._points[scene], stored["translation"], stored["present"])
-        return {
-            "point_position": torch.from_numpy(position),
-            "point_visible": torch.from_numpy(visible),
-            **self._static[scene],
-        }
 
 
 class LightTransportDataset(Dataset[dict[str, Tensor]]):
@@ -113,7 +105,16 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 def place_points(
     points: dict[str, np.ndarray], translation: np.ndarray, present: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), metres, and visibility (N,) of points, given `translation` (M, 3) and `present` (M,)."""
+    """Move and hide the points of a scene according to a state (supplementary, Sec. Datasets).
+
+    Args:
+        points: the scene's point cloud.
+        translation: (M, 3), metres, of each movable object.
+        present: (M,), whether each object is in the scene.
+
+    Returns:
+        Positions (N, 3), metres, and visibility (N,).
+    """
     # Static points have object index -1 and so select the appended row, which leaves them in place.
     translation, present = np.concatenate([translation, np.zeros((1, 3), np.float32)]), np.append(present, True)
     return points["position"] + translation[points["object"]], present[points["object"]]
