@@ -1,4 +1,4 @@
-"""`nlt data`: verify finds all that is wrong and nothing else, stats counts right, show draws twelve pictures."""
+"""`nlt data`: verify finds every fault and nothing else, stats counts correctly, show draws twelve pictures."""
 
 import json
 import re
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def verify(dataset, tmp_path, capfd):
-    """(a copy of the dataset to harm, a function that verifies it and returns exit code, findings, stderr)"""
+    """Return a copy of the dataset and a function that verifies it: exit code, findings and the last line of stderr."""
     directory = Path(shutil.copytree(dataset, tmp_path / dataset.name))
 
     def run():
@@ -40,7 +40,7 @@ def verify(dataset, tmp_path, capfd):
 
 
 def rewrite(path, **changes):
-    """Change arrays in place, with checksums that fit: `changes` maps a field to a function."""
+    """Change arrays in place and update their checksums; `changes` maps a field to a function."""
     arrays = load_file(path)
     for name, change in changes.items():
         arrays[name] = arrays[name].copy()
@@ -62,7 +62,7 @@ def test_nothing_wrong(verify):
 
 
 def test_one_bright_pixel_is_fine(verify):
-    """At 1 spp an image can be black and another nearly so, without anything being wrong."""
+    """At 1 spp, one image can be black and another nearly black although nothing is wrong."""
     directory, run = verify
 
     def one_pixel(noisy):
@@ -164,7 +164,7 @@ def test_stats(dataset, tmp_path, monkeypatch, capfd):
 
 
 def test_stats_count_the_chosen_spp(tmp_path, monkeypatch):
-    """The dataset's references as the pilot views chose, the paper's as its scale says."""
+    """The dataset's references count with the spp that the pilot views chose, the paper's with those of its scale."""
     spec, counted = spec_of("living_room", "egg", reference_mse=1e-3, reference_spp=512), []
     write_manifest(tmp_path, spec, "")
     for scene, spp in enumerate((128, 32)):

@@ -1,4 +1,4 @@
-"""Generation: the same bytes however often interrupted, wherever it runs and wherever it writes to."""
+"""Generation writes the same bytes however often it is interrupted, on every engine and on every file system."""
 
 import errno
 import json
@@ -56,7 +56,7 @@ with _locked(Path(sys.argv[1])):
 
 
 def test_leftovers_of_a_killed_writer(tmp_path):
-    """A writer that lives keeps its file; one that was killed does not, though nobody has reaped it yet."""
+    """A live writer keeps its temporary file; a killed writer loses it even while the process is still a zombie."""
     half = tmp_path / f".half.safetensors.{files._HOST}.1.tmp"
     foreign = tmp_path / ".half.safetensors.elsewhere.1.tmp"
     foreign.write_bytes(b"half")
@@ -72,7 +72,7 @@ def test_leftovers_of_a_killed_writer(tmp_path):
 
 
 def test_a_leftover_removed_before_it_is_locked(tmp_path, monkeypatch):
-    """The writer notices that its temporary file is gone, and opens it again."""
+    """A writer notices that its temporary file was deleted before it was locked, and opens it again."""
     removed, lock = [], files.fcntl.flock
 
     def removed_first(file, operation):
@@ -102,7 +102,7 @@ def as_shown(radiance, exposure):
 
 @pytest.mark.parametrize(("most", "target"), [(4096, 1e-3), (4096, 3e-6), (1000, 1e-5), (20, 1e-3), (32, 1e-3)])
 def test_chosen_spp_by_trying_all(most, target):
-    """The first power of two, from the pilot's samples on, that brings the MSE below the target; or the most."""
+    """The choice is the first power of two, from the pilot's spp on, whose MSE is below the target, or the maximum."""
     spec = spec_of(reference_spp=most, reference_mse=target)
     pilot = min(32, most)
     for mse in [0.0, target, *np.random.default_rng(0).uniform(0, 20, 50) * target]:
@@ -111,7 +111,7 @@ def test_chosen_spp_by_trying_all(most, target):
 
 
 def test_pilot_measures_the_halves_disagreement(piloted):
-    """Against numpy's mean over many pairs of halves, of the same views and rendered with other seeds."""
+    """The pilot's MSE agrees with numpy's mean over many pairs of halves of the same views with other seeds."""
     spec = spec_of(**PILOTED)
     render, errors = SampleRenderer(spec, 0), []
     for split, index in (("test", 0), ("test", 1), ("test", 2), ("val", 0)):
@@ -125,7 +125,7 @@ def test_pilot_measures_the_halves_disagreement(piloted):
 
 
 def test_references_have_the_chosen_spp(piloted):
-    """The same bytes as with this number given; both splits."""
+    """In both splits, references have the bytes that a spec with this fixed spp gives."""
     (reference,) = store.references(piloted, spec_of(**PILOTED))
     assert 32 < reference["spp"] <= 100, "the target is one that the pilot's own samples do not reach"
     render = SampleRenderer(spec_of(**{**PILOTED, "reference_spp": reference["spp"], "reference_mse": 0}), 0)
@@ -143,7 +143,7 @@ def _stopped(*_):
 
 
 def test_chosen_once(piloted, tmp_path, monkeypatch):
-    """A generation that ends after the choice goes on with it; a file that is lost is chosen again, the same."""
+    """A generation stopped after the choice keeps it; a lost file is chosen again, with the same result."""
     spec = spec_of(**PILOTED)
     with monkeypatch.context() as patch:
         patch.setattr(generation, "_announce", _stopped)
@@ -196,20 +196,20 @@ RUN = f"""if __name__ == "__main__":
 
 
 def start(root, scene):
-    """A generation of sixteen shards of 64 samples, in a process group of its own."""
+    """Start a generation of sixteen shards of 64 samples in its own process group."""
     command = [sys.executable, "-c", RUN, str(root), scene]
     quiet = subprocess.DEVNULL
     return subprocess.Popen(command, cwd=PROJECT, start_new_session=True, stdout=quiet, stderr=quiet)
 
 
 def shards(directory):
-    """Every shard and point cloud: bytes, and what shows that it was not touched."""
+    """Return the bytes of every shard and point cloud, with the inode and the time that show whether it was touched."""
     found = {path: (path.read_bytes(), path.stat()) for path in directory.rglob("*.safetensors")}
     return {str(p.relative_to(directory)): (data, s.st_ino, s.st_mtime_ns) for p, (data, s) in found.items()}
 
 
 def test_sixteen_shards_survive(tmp_path):
-    """kill -9 of everything at ten random moments; then two runs at a time, a flipped bit, a deleted shard."""
+    """A generation survives kill -9 at ten random moments, two concurrent runs, a flipped bit and a deleted shard."""
     scene = str(write_room(tmp_path / "room"))
     spec = DatasetSpec([scene], **LONG)
     assert start(tmp_path / "undisturbed", scene).wait(120) == 0
@@ -254,7 +254,7 @@ _render = generation._render
 
 
 def _killed_once(spec, directory, variant, job, *rest):
-    """A worker that is killed after its first shard, once."""
+    """Kill the worker once, after its first shard."""
     marker = Path(directory).parent / "killed"
     if not marker.exists():
         marker.touch()
@@ -283,7 +283,7 @@ def test_worker_killed_twice(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("preload", [(), ("json",)])
 def test_nothing_outlives_a_killed_command(preload, tmp_path):
-    """Its processes end, forked ones too; what these start, they start as ever."""
+    """When the command is killed, its spawned and forked processes end; their children use the default start method."""
     (tmp_path / "beating.py").write_text(
         "import multiprocessing\nimport time\nfrom pathlib import Path\n"
         "def beat(job, threads, tick):\n"
@@ -314,7 +314,7 @@ def test_nothing_outlives_a_killed_command(preload, tmp_path):
 
 @pytest.mark.parametrize("experiment", ["static", "fixed_lights", "moving_lights"])
 def test_no_kernel_is_compiled_anew(experiment):
-    """By Dr.Jit's record: a new view, state or number of photons per emitter runs what the first sample compiled."""
+    """A new view, state or number of photons per emitter runs the kernels that the first sample compiled."""
     if not is_jit():
         pytest.skip("the scalar variant compiles nothing")
     render = SampleRenderer(spec_of(experiment=experiment, train=8, test=2), 0)
@@ -333,7 +333,7 @@ def test_no_kernel_is_compiled_anew(experiment):
 
 
 def _kills_its_dask_worker(spec, directory, variant, job, *rest):
-    """After its first shard, once: the process that runs the job is the Dask worker's child."""
+    """Kill the Dask worker, which is the parent of the job's process, once after the first shard."""
     marker = Path(directory).parent / "killed"
     if not marker.exists():
         _render(spec, directory, variant, generation.Job(job.scene, job.shards[:1], False), *rest)
@@ -351,7 +351,7 @@ def cluster():
 
 
 def test_killed_dask_worker(cluster, dataset, tmp_path, monkeypatch):
-    """kill -9 of one of two workers, within a job: the run ends complete, and is the same as here."""
+    """The run is complete and has the same bytes although one of two Dask workers is killed during a job."""
     monkeypatch.setattr(generation, "_render", _kills_its_dask_worker)
     workers = {worker.pid for worker in cluster.workers.values()}
     assert content(generate(spec_of(), tmp_path, scheduler=cluster.scheduler_address)) == content(dataset)
@@ -361,7 +361,7 @@ def test_killed_dask_worker(cluster, dataset, tmp_path, monkeypatch):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """submitit writes its logs where the command runs, and its tasks know only what is installed."""
+    """Run where submitit may write its logs, and let its tasks import what this process can."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
 
@@ -380,7 +380,7 @@ def test_mistake_far_away(where, tmp_path, monkeypatch, request, elsewhere):
 
 
 def test_slurm(dataset, tmp_path, monkeypatch, elsewhere):
-    """By submitit's own stand-in for Slurm; a task is killed, once."""
+    """A task that submitit's local stand-in for Slurm runs is killed once; the bytes are the same."""
     monkeypatch.setattr(generation, "_render", _killed_once)
     monkeypatch.setattr("submitit.Job._results_timeout_s", 0)  # for file systems that are late
     assert content(generate(spec_of(), tmp_path, workers=2, scheduler="slurm-local")) == content(dataset)
@@ -388,7 +388,7 @@ def test_slurm(dataset, tmp_path, monkeypatch, elsewhere):
 
 
 def test_slurm_script(tmp_path, monkeypatch, elsewhere):
-    """What a cluster would be given: an array of the jobs, with the user's options."""
+    """A cluster would get an array of the jobs with the user's options."""
     for name in ("srun", "sbatch"):
         (tmp_path / name).write_text("#!/bin/sh\ncat $1 > given; echo no such partition >&2; exit 1\n")
         (tmp_path / name).chmod(0o755)
@@ -428,7 +428,7 @@ def test_missing_extra(scheduler, package, monkeypatch):
 
 
 def test_files_that_nobody_sees(tmp_path, monkeypatch):
-    """Workers that write to a disk of their own."""
+    """Generation reports that the files of workers with a disk of their own are missing."""
     monkeypatch.setattr(generation, "_render", _writes_nothing)
     monkeypatch.setattr(generation, "_announce", lambda *_: None)
     with pytest.raises(UserError, match=r"is still missing; check that all machines see this directory"):
@@ -444,7 +444,7 @@ def _writes_nothing(*_):
 
 @pytest.fixture
 def remote(tmp_path, monkeypatch):
-    """The URL of a store that worker processes know as they know s3://: by the entry point of a package."""
+    """Return a URL whose file system worker processes find like s3://, by a package's entry point."""
     package = tmp_path / "packages" / "remote-1.dist-info"
     package.mkdir(parents=True)
     (package / "entry_points.txt").write_text("[fsspec.specs]\nremote = remote:RemoteFileSystem\n")
@@ -459,7 +459,7 @@ def remote(tmp_path, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:UPath 'remote'")
 def test_remote(remote, dataset, tmp_path, monkeypatch):
-    """Generated to a URL and read back from it: the same samples; every file fetched once, a damaged copy again."""
+    """A dataset generated at a URL has the same samples; every file is fetched once, and a damaged copy again."""
     objects = tmp_path / "store"
     directory = generate(spec_of(), remote, workers=2)
     names = {f"bucket%datasets%{directory.name}%{name}".replace("/", "%"): name for name in content(dataset)}
@@ -524,7 +524,7 @@ def test_full_disk_within_a_write(tmp_path, monkeypatch):
 
 
 def _fills_the_disk(*arguments):
-    """The second file that this process writes finds no room."""
+    """The disk is full when this process writes its second file."""
     written, fsync = [], os.fsync
 
     def full(file):

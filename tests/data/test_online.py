@@ -1,4 +1,4 @@
-"""Online training: samples that are those of a stored set without end, each seen once, in states of its own."""
+"""Online training: its samples are those of an endless stored dataset, and each is used once."""
 
 import json
 import runpy
@@ -26,7 +26,7 @@ pytest_plugins = ["training_fixtures"]
 
 @pytest.fixture(scope="module")
 def online(tmp_path_factory):
-    """A config of online training and the dataset that `nlt generate` makes of it: (file, spec, directory)."""
+    """Return a config of online training, its spec, and the directory that `nlt generate` fills for it."""
     folder = tmp_path_factory.mktemp("online")
     data = {"dataset": {**DATASET, "train": 4}, "root": str(folder / "datasets"), "batch_size": 2, "online": True}
     file = write(folder / "data.yaml", {"data": data})
@@ -50,7 +50,7 @@ def test_nothing_is_stored_for_training(online):
 
 
 def test_batches_are_those_of_a_stored_set_without_end(online):
-    """Two passes of two processes, against samples that a renderer of a larger stored set makes in this process."""
+    """Two passes of two processes give the samples that a larger stored dataset would have."""
     loader = module_of(online, workers=2).train_dataloader()
     batches = [batch for _ in range(2) for batch in loader]
     assert [batch["index"].tolist() for batch in batches] == [[0, 1], [2, 3], [4, 5], [6, 7]]
@@ -81,7 +81,7 @@ def numbers(module, passes, rank=0, processes=1, length=7):
 
 
 def test_no_number_comes_twice(online):
-    """Not across passes, ranks, seeds, or a resumed run; a stored set's epochs, in contrast, are the same samples."""
+    """No sample comes twice in passes, ranks, seeds or after resuming; epochs of a stored dataset repeat theirs."""
     ranks = [numbers(module_of(online), 3, rank, 2) for rank in (0, 1)]
     assert all(len(one) == 3 for rank in ranks for one in rank)
     other = numbers(module_of(online, seed=1), 3)
@@ -99,7 +99,7 @@ def test_no_number_comes_twice(online):
 
 
 def test_states_of_the_evaluated_splits_are_left_out(tmp_path):
-    """With two states there are, and one of them taken by the test split, only the other is trained on."""
+    """If there are two states and the test split has one of them, training uses only the other."""
     file = write_yaml(tmp_path / "scene.yaml", objects={"rug": {"shapes": ["rug"], "box": [[0, 0, 0], [0, 0, 0]]}})
     spec = spec_of(str(file), experiment="fixed_lights", train=3, val=0, test=1).without_train()
     render = SampleRenderer(spec, 0)
@@ -124,7 +124,7 @@ def test_mistakes(online, tmp_path):
 
 
 def test_benchmark_reads_the_curves(tmp_path):
-    """Which arm is best when: by hand for two straight curves, of which one begins after 30 s of generation."""
+    """The best arm agrees with a computation by hand for two straight curves, one of which starts at 30 s."""
     functions = runpy.run_path(str(PROJECT / "benchmarks/online.py"))
     row = lambda arm, extra, t, mse: {"arm": arm, "seed": 0, "generation_s": extra, "train_s": t, "steps": t,
                                       "images_seen": 8 * t, "mse": mse, "mssim": 1 - mse}  # fmt: skip
@@ -143,7 +143,7 @@ def test_benchmark_reads_the_curves(tmp_path):
 
 
 def test_fit(online, tmp_path, monkeypatch, one_thread):
-    """Through the command line, stopped within an epoch and resumed: no sample is trained on twice."""
+    """A run of `nlt fit` that is stopped within an epoch and resumed trains on no sample twice."""
     monkeypatch.chdir(tmp_path)
     seen = []
     for run, (steps, *more) in enumerate([(3,), (5, "--ckpt_path")]):
