@@ -96,7 +96,8 @@ def parse(kind: type[T], content: Any, place: object, section: str = "") -> T:
 
 def _fields(location: Sequence[int | str]) -> list[int | str]:
     """Return the keys of an error's location, without the names that pydantic gives to the members of a union."""
-    return [part for part in location if isinstance(part, int) or part.replace("_", "").replace("-", "").isalnum()]
+    keys = [part for part in location if part not in ("float", "int", "str", "bool")]
+    return [key for key in keys if isinstance(key, int) or key.replace("_", "").replace("-", "").isalnum()]
 
 
 def _problem(kind: Any, error: Mapping[str, Any]) -> str:

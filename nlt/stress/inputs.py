@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
 from nlt.data.sample import BATCH_FIELDS, FIELDS
 from nlt.models.method import Batch
@@ -38,33 +38,34 @@ def _spp(batch: Batch, spp: float) -> Batch:
     return batch | {"noisy_input": torch.where(chosen, batch[f"input_{more}"], batch[f"input_{less}"])}
 
 
-def _moved(batch: Batch, rotation: Tensor, translation: Tensor) -> Batch:
+def _moved(batch: Batch, rotation: np.ndarray, translation: np.ndarray) -> Batch:
     """Apply the rigid motion x -> R x + t to scene and camera, which leaves the image the same."""
-    back = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
-    back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ translation
-    changed = {"world_to_view": batch["world_to_view"].to(back.dtype) @ back}
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, translation
+    forward, back = (torch.tensor(m, device=batch["depth"].device) for m in (motion, np.linalg.inv(motion)))
+    turn, shift = forward[:3, :3], forward[:3, 3]
+    changed = {"world_to_view": batch["world_to_view"].double() @ back}
     for name in ("point_position", "photon_hit", "photon_origin"):
-        changed[name] = batch[name].to(back.dtype) @ rotation.T + translation
-    changed["photon_direction"] = batch["photon_direction"].to(back.dtype) @ rotation.T
+        changed[name] = batch[name].double() @ turn.T + shift
+    changed["photon_direction"] = batch["photon_direction"].double() @ turn.T
     for name in ("normal", "view_direction"):
-        changed[name] = torch.einsum("ij,bjhw->bihw", rotation, batch[name].to(back.dtype))
+        changed[name] = torch.einsum("ij,bjhw->bihw", turn, batch[name].double())
     return batch | {name: value.to(batch[name].dtype) for name, value in changed.items()}
 
 
-def _shifted(batch: Batch, metres: float, up: Tensor, middle: Tensor) -> Batch:
-    level = (up == 0).to(up.dtype)
-    return _moved(batch, torch.diag(torch.ones_like(up)), metres * level / level.norm())
+def _shifted(batch: Batch, metres: float, up: np.ndarray, middle: np.ndarray) -> Batch:
+    """Move along the diagonal of the two horizontal axes."""
+    level = (up == 0) / np.linalg.norm(up == 0)
+    return _moved(batch, np.eye(3), metres * level)
 
 
-def _turned(batch: Batch, degrees: float, up: Tensor, middle: Tensor) -> Batch:
-    """Turn about the vertical through the middle of the camera's box (Rodrigues' formula)."""
-    angle = torch.tensor(np.radians(degrees), device=up.device)
-    cross = torch.linalg.cross(torch.diag(torch.ones_like(up)), up.expand(3, 3), dim=1)
-    rotation = torch.eye(3, dtype=up.dtype, device=up.device) + angle.sin() * cross + (1 - angle.cos()) * cross @ cross
+def _turned(batch: Batch, degrees: float, up: np.ndarray, middle: np.ndarray) -> Batch:
+    """Turn about the vertical through the middle of the camera's box."""
+    rotation = Rotation.from_rotvec(degrees * up, degrees=True).as_matrix()
     return _moved(batch, rotation, middle - rotation @ middle)
 
 
-def _mirrored(batch: Batch, _: float, up: Tensor, middle: Tensor) -> Batch:
+def _mirrored(batch: Batch, _: float, up: np.ndarray, middle: np.ndarray) -> Batch:
     """Mirror every image, and the camera's matrix so that points fall on the pixels where they are visible."""
     width = batch["depth"].shape[-1]
     flip = torch.tensor([[-1.0, 0, width], [0, 1, 0], [0, 0, 1]], device=batch["depth"].device)
@@ -72,7 +73,7 @@ def _mirrored(batch: Batch, _: float, up: Tensor, middle: Tensor) -> Batch:
     return batch | images | {"camera_matrix": flip @ batch["camera_matrix"]}
 
 
-FRAME: dict[str, Callable[[Batch, float, Tensor, Tensor], Batch]] = {
+FRAME: dict[str, Callable[[Batch, float, np.ndarray, np.ndarray], Batch]] = {
     "shifted": _shifted, "turned": _turned, "mirrored": _mirrored,
 }  # fmt: skip
 BUDGET: dict[str, Callable[[Batch, float], Batch]] = {

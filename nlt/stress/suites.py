@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from nlt.config import read_configs
+from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
+
+from nlt.config import Settings, parse, read_configs
 from nlt.data.files import AnyPath, open_path
-from nlt.data.spec import DatasetSpec, check_keys
-from nlt.errors import UserError
+from nlt.data.spec import DatasetSpec
 from nlt.paths import find_config
 
 CLEAN, FLICKER, TRAINING = "clean", "flicker", "training"
@@ -20,40 +19,63 @@ RENDERED = ("light", "geometry", "materials", "camera")  # suites whose views ar
 COMPUTED = ("budget", "frame")  # suites that change a rendered view's inputs
 PATHS = ("camera", "light", "object")  # of the suite flicker, by the thing that moves
 SUITES = (*RENDERED, *COMPUTED, FLICKER, TRAINING)
-_KEYS = {
-    "": ("version", "seed", "views", "reference", "traced", *SUITES),
-    FLICKER: ("draws", "frames", *PATHS),
-    TRAINING: ("share", "seeds", "learning_rate", "precision", "corrupted"),
-}
-_LADDER = ("change", "values", "says")
+Number = float | int  # 2 and 2.0 stay as they are written, because the hash of a manifest names what was rendered
 
 
-@dataclass(frozen=True)
-class Ladder:
+class Ladder(Settings):
     """One change at growing severity; `values[k]` belongs to severity k + 1."""
 
-    suite: str
-    name: str
     change: str
-    values: tuple[float, ...]
+    values: tuple[Number, ...] = Field(min_length=1, max_length=5)
     says: str
 
 
-@dataclass(frozen=True)
-class Suites:
-    """A manifest; `ladders` are those of the rendered and computed suites."""
+class Flicker(Settings):
+    """The suite flicker: the number of draws of the inputs, and the frames and lengths of the smooth paths."""
 
-    file: Path
-    content: Mapping[str, Any]
-    ladders: tuple[Ladder, ...]
+    draws: int = Field(ge=2)
+    frames: int = Field(ge=2)
+    camera: Number
+    light: Number
+    object: Number
+
+
+class Trainings(Settings):
+    """The suite training: the share of a scale's steps, and the values of each variation."""
+
+    share: Number = Field(gt=0)
+    seeds: int = Field(ge=1)
+    learning_rate: tuple[Number, ...]
+    precision: str
+    corrupted: Number = Field(gt=0, le=1)
+
+
+class Suites(Settings):
+    """A manifest; configs/stress/suites.yaml explains its fields. `file` is where it was read."""
+
+    file: SkipJsonSchema[Path] = Field(exclude=True)
+    version: int = Field(ge=1)
+    seed: int = Field(ge=0)
+    views: int = Field(ge=1)
+    reference: int = Field(ge=1)
+    traced: tuple[int, ...]
+    light: dict[str, Ladder]
+    geometry: dict[str, Ladder]
+    materials: dict[str, Ladder]
+    camera: dict[str, Ladder]
+    budget: dict[str, Ladder]
+    frame: dict[str, Ladder]
+    flicker: Flicker
+    training: Trainings
 
     @property
-    def views(self) -> int:
-        return int(self.content["views"])
+    def ladders(self) -> dict[tuple[str, str], Ladder]:
+        """The ladders of the rendered and computed suites, by suite and name."""
+        return {(suite, k): ladder for suite in (*RENDERED, *COMPUTED) for k, ladder in getattr(self, suite).items()}
 
     def directory(self, spec: DatasetSpec, root: str | AnyPath) -> AnyPath:
         """Return the directory of a dataset's rendered suites, named by the dataset and a hash of the manifest."""
-        relevant = {key: value for key, value in self.content.items() if key not in (*COMPUTED, TRAINING)}
+        relevant = self.model_dump(mode="json", exclude={*COMPUTED, TRAINING})
         digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:8]
         return open_path(root) / f"{spec.directory(root).name}-stress-{digest}"
 
@@ -65,31 +87,5 @@ def load_suites(config: str, views: int | None = None) -> Suites:
         UserError: a key is unknown or missing, or a value is wrong.
     """
     file = find_config("stress", config)
-    content = read_configs([str(file)]) | ({} if views is None else {"views": views})
-    ladders = []
-    for section, known in _KEYS.items():
-        _check(file, section, content.get(section, {}) if section else content, known)
-    for suite in (*RENDERED, *COMPUTED):
-        if not isinstance(content[suite], Mapping):
-            raise UserError(f"{file}: {suite}: must be a mapping from names to ladders, is {content[suite]!r}")
-        for name, ladder in content[suite].items():
-            _check(file, f"{suite}.{name}", ladder, _LADDER)
-            values = ladder["values"]
-            if (
-                not isinstance(values, list)
-                or not 1 <= len(values) <= 5
-                or any(type(v) not in (int, float) for v in values)
-            ):
-                raise UserError(f"{file}: {suite}.{name}.values: must be a list of one to five numbers, is {values!r}")
-            ladders.append(Ladder(suite, name, ladder["change"], tuple(map(float, values)), ladder["says"]))
-    for key in ("version", "views", "reference"):
-        if not isinstance(content[key], int) or content[key] < 1:
-            raise UserError(f"{file}: {key}: must be a whole number of at least 1, is {content[key]!r}")
-    return Suites(file, content, tuple(ladders))
-
-
-def _check(file: Path, section: str, content: Any, known: tuple[str, ...]) -> None:
-    place = f"{file}: {section + ': ' if section else ''}"
-    if not isinstance(content, Mapping):
-        raise UserError(f"{place}must be a mapping with the keys {', '.join(known)}, is {content!r}")
-    check_keys(place, content, known, known)
+    content = read_configs([file]) | {"file": str(file)} | ({} if views is None else {"views": views})
+    return parse(Suites, content, file)

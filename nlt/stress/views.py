@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -20,11 +20,10 @@ from nlt.errors import UserError
 from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
-from nlt.models.module import RenderingModule
 from nlt.models.transport import PointEmbedding
 from nlt.stress.inputs import BUDGET, FRAME
-from nlt.stress.rendering import DRAWS, ViewSet, read_views, view_sets
-from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, Suites
+from nlt.stress.rendering import DRAWS, ViewSet, read_views
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
 
 
 class SuiteViews:
@@ -35,24 +34,22 @@ class SuiteViews:
         directory: AnyPath,
         spec: DatasetSpec,
         suites: Suites,
-        wanted: list[str],
+        sets: list[ViewSet],
         device: torch.device,
     ) -> None:
         self.directory, self.spec, self.suites, self.device = directory, spec, suites, device
-        self.view_sets = view_sets(spec, suites, wanted)
-        self.batches = cache(self._batches)
+        self.view_sets = sets
+        self.batch = cache(self._batch)
 
-    def _batches(self, suite: str) -> dict[tuple[str, int], list[Batch]]:
-        """Return a batch per scene for each ladder and severity of a rendered suite."""
-        batches: dict[tuple[str, int], list[Batch]] = {}
-        for view_set in self.view_sets:
-            if view_set.suite == suite:
-                batches.setdefault((view_set.ladder, view_set.severity), []).append(self._batch(view_set))
-        return batches
-
-    def _batch(self, view_set: ViewSet) -> Batch:
-        batch = read_views(self.directory, self.spec, self.suites, view_set)
+    def _batch(self, view_set: ViewSet, points: Points | None = None) -> Batch:
+        """Return the views of a set, with its own points or with others."""
+        batch = read_views(self.directory, self.spec, self.suites, view_set, points)
         return {name: value.to(self.device) for name, value in batch.items()}
+
+    @property
+    def clean(self) -> list[Batch]:
+        """The unchanged test views of each scene."""
+        return [self.batch(view_set) for view_set in self.view_sets if view_set.suite == CLEAN]
 
     def references(self, suite: str) -> dict[str, np.ndarray]:
         """Return the radiance (V, 3, H, W) at the highest severity, by ladder, and the exposure (V,)."""
@@ -75,23 +72,27 @@ class SuiteViews:
         return rows, images
 
     def _changed(self, suite: str, method: Method | None) -> Iterator[tuple[str, int, list[Batch]]]:
+        """Yield each ladder and severity of a suite that can affect the method, with a batch per scene."""
         if suite not in COMPUTED:
-            for (ladder, severity), batches in self.batches(suite).items():
-                yield ladder, severity, batches
+            mine = [view_set for view_set in self.view_sets if view_set.suite == suite]
+            for name, severity in dict.fromkeys((view_set.ladder, view_set.severity) for view_set in mine):
+                yield name, severity, [self.batch(s) for s in mine if (s.ladder, s.severity) == (name, severity)]
             return
-        clean = self.batches(CLEAN)["views", 0]
-        for one in self.suites.ladders:
-            if one.suite == suite and (method is None or _reads(method, one.change)):
-                for severity, value in enumerate(one.values, 1):
-                    with _fewer_pixels(method, value if one.change == "pixels" else None):
-                        yield one.name, severity, [self._compute(batch, one.change, value) for batch in clean]
+        hparams: dict[str, Any] = getattr(method, "hparams", {})
+        own = dict(hparams)
+        for (owner, name), ladder in self.suites.ladders.items():
+            if owner == suite and (method is None or _reads(method, ladder.change)):
+                for severity, value in enumerate(ladder.values, 1):
+                    if ladder.change == "pixels":
+                        hparams["one_in"] = value
+                    yield name, severity, [self._compute(batch, ladder.change, value) for batch in self.clean]
+                hparams.update(own)
 
     def _compute(self, batch: Batch, change: str, value: float) -> Batch:
         if change in BUDGET:
             return BUDGET[change](batch, value)
         description = self.spec.descriptions[int(batch["scene"][0])]
-        up, middle = (torch.tensor(v, device=self.device) for v in (description.up, description.camera.mean(0)))
-        return FRAME[change](batch, value, up, middle)
+        return FRAME[change](batch, value, description.up, description.camera.mean(0))
 
     def rows(self, method: Method, batches: list[Batch]) -> tuple[list[dict[str, Any]], np.ndarray]:
         """Return a row per view, and the radiance (V, 3, H, W), 0 where it is not finite."""
@@ -133,71 +134,54 @@ class SuiteViews:
         a path is the mean square change from frame to frame, relative to the reference's.
         """
         rows = []
-        for scene, clean in enumerate(self.batches(CLEAN)["views", 0]):
+        for scene, clean in enumerate(self.clean):
+            mine = [view_set for view_set in self.view_sets if (view_set.suite, view_set.scene) == (FLICKER, scene)]
+            draws = [view_set for view_set in mine if view_set.ladder == DRAWS]
             a, b = (expose(clean[f"reference_{half}"].double(), clean["exposure"]) for half in "ab")
             scale = (a * b).mean().item()
+            row = lambda kind, value, images, scene=scene: {
+                "ladder": kind, "severity": 0, "scene": scene, "value": value,
+                "nonfinite": int((~images.isfinite()).sum()),
+            }  # fmt: skip
             for kind in ("points", "photons", "noise"):
-                if _reads(method, {"noise": "spp"}.get(kind, kind)):
-                    images = [expose(p, clean["exposure"]) for p in self._draws(method, scene, clean, kind)]
-                    variance = torch.stack(images).var(0).mean().item()
-                    rows.append({"ladder": kind, "severity": 0, "scene": scene, "value": (variance / scale) ** 0.5,
-                                 "nonfinite": sum(int((~d.isfinite()).sum()) for d in images)})  # fmt: skip
-            for kind in PATHS:
-                if (kind, 0) not in self.batches(FLICKER) or len(self.batches(FLICKER)[kind, 0]) <= scene:
-                    continue
-                frames = self.batches(FLICKER)[kind, 0][scene]
+                if _reads(method, kind):
+                    predictions = (self._with_drawn(method, clean, draw, kind) for draw in draws)
+                    images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
+                    rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
+            for view_set in (view_set for view_set in mine if view_set.is_path):
+                frames = self.batch(view_set)
                 own, a, b = (
                     expose(x.double(), frames["exposure"]).diff(dim=0)
                     for x in (self.predict(method, frames), frames["reference_a"], frames["reference_b"])
                 )
-                value = (own.square().mean() / (a * b).mean()).item()
-                rows.append({"ladder": kind, "severity": 0, "scene": scene, "value": value,
-                             "nonfinite": int((~own.isfinite()).sum())})  # fmt: skip
+                rows.append(row(view_set.ladder, (own.square().mean() / (a * b).mean()).item(), own))
         return rows
 
-    def _draws(self, method: Method, scene: int, clean: Batch, kind: str) -> Iterator[Tensor]:
-        for view_set in self.view_sets:
-            if view_set.suite != FLICKER or view_set.ladder != DRAWS or view_set.scene != scene:
-                continue
-            if kind == "points":
-                yield self._with_points(method, view_set, clean)
-                continue
+    def _with_drawn(self, method: Method, clean: Batch, draw: ViewSet, kind: str) -> Tensor:
+        """Predict the clean views with another draw of points, photons or input noise."""
+        if kind != "points":
             prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
-            drawn = self.batches(FLICKER)[DRAWS, view_set.severity][scene]
-            yield self.predict(method, clean | {name: v for name, v in drawn.items() if name.startswith(prefix)})
-
-    def _with_points(self, method: Method, view_set: ViewSet, clean: Batch) -> Tensor:
-        """Predict with another draw of points, each with the embedding of training's nearest point of its object."""
-        drawn = read_points(self.directory / view_set.points_name)
-        base = next(r for r in self.view_sets if r.suite == CLEAN and r.scene == view_set.scene)
-        points = read_points(self.directory / base.points_name)
-        moved = read_views(self.directory, self.spec, self.suites, base, drawn)
-        fields = {name: value.to(self.device) for name, value in moved.items() if name.startswith("point_")}
-        batch = clean | fields
-        with _embeddings_of(method, view_set.scene, points, drawn):
-            return self.predict(method, batch)
+            drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
+            return self.predict(method, clean | drawn)
+        clean_set = next(s for s in self.view_sets if (s.suite, s.scene) == (CLEAN, draw.scene))
+        before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
+        return self.predict(_with_nearest_embeddings(method, draw.scene, before, after), self._batch(clean_set, after))
 
 
-@contextmanager
-def _embeddings_of(method: Method, scene: int, points: Points, drawn: Points) -> Iterator[None]:
-    tables = [module for module in method.modules() if isinstance(module, PointEmbedding)]
-    kept = [module.table.weight.data for module in tables]
-    for module, weight in zip(tables, kept, strict=True):
-        count = module.num_points
-        rows = np.arange(count)
-        for owner in np.unique(drawn["object"][:count]):
-            mine, theirs = (np.flatnonzero(cloud["object"][:count] == owner) for cloud in (drawn, points))
-            if len(theirs):
-                rows[mine] = theirs[cKDTree(points["position"][theirs]).query(drawn["position"][mine])[1]]
-        changed = weight.clone()
-        first = scene * count
-        changed[first : first + count] = weight[first + torch.from_numpy(rows).to(weight.device)]
-        module.table.weight.data = changed
-    try:
-        yield
-    finally:
-        for module, weight in zip(tables, kept, strict=True):
-            module.table.weight.data = weight
+def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Method:
+    """Return a copy in which a scene's points have the embedding of the nearest former point of the same object."""
+    method = copy.deepcopy(method)
+    for module in method.modules():
+        if isinstance(module, PointEmbedding):
+            count = module.num_points
+            # The objects are so far apart that the nearest point is of the same object.
+            before_at, after_at = (
+                np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
+            )
+            nearest = torch.from_numpy(cKDTree(before_at).query(after_at)[1])
+            rows = module.table.weight.data[scene * count : (scene + 1) * count]
+            rows[:] = rows[nearest.to(rows.device)]
+    return method
 
 
 def relative_error(prediction: Tensor, a: Tensor, b: Tensor, exposure: Tensor) -> Tensor:
@@ -214,19 +198,5 @@ def _reads(method: Method, change: str) -> bool:
     """Return whether a change of the inputs can affect a method."""
     if change == "pixels":
         return "one_in" in getattr(method, "hparams", ())
-    inputs = {"points": "point_visible", "photons": "photon_flux", "spp": "noisy_input"}
+    inputs = {"points": "point_visible", "photons": "photon_flux", "spp": "noisy_input", "noise": "noisy_input"}
     return change not in inputs or inputs[change] in method.fields
-
-
-@contextmanager
-def _fewer_pixels(method: Method | None, one_in: float | None) -> Iterator[None]:
-    if one_in is None or method is None:
-        yield
-        return
-    assert isinstance(method, RenderingModule)
-    before = method.hparams["one_in"]
-    method.hparams["one_in"] = one_in
-    try:
-        yield
-    finally:
-        method.hparams["one_in"] = before

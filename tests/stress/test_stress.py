@@ -44,8 +44,7 @@ MANIFEST = CONFIGS / "stress" / "suites.yaml"
 def test_the_manifest_names_changes_that_there_are():
     suites = load_suites("suites")
     known = {*MESHES, *PLACES, "points", "photons", "pixels", "spp", "shifted", "turned", "mirrored"}
-    assert {ladder.change for ladder in suites.ladders} == known
-    assert len({(ladder.suite, ladder.name) for ladder in suites.ladders}) == len(suites.ladders)
+    assert {ladder.change for ladder in suites.ladders.values()} == known
 
 
 def test_fewer_views_are_another_set(spec, tmp_path):
@@ -59,11 +58,14 @@ def test_fewer_views_are_another_set(spec, tmp_path):
     ("change", "message"),
     [
         ({"colour": {}}, "colour: unknown key"),
-        ({"light": None}, "light"),
-        ({"views": 0}, "views: must be a whole number of at least 1"),
-        ({"camera": {"near": {"change": "near", "values": [], "says": ""}}}, r"camera.near.values: must be a list"),
-        ({"camera": {"near": {"change": "near", "values": [1]}}}, "camera.near: says: missing"),
-        ({"camera": {"near": {"change": "near", "values": ["a"], "says": ""}}}, r"camera.near.values: must be a list"),
+        ({"light": None}, "light: must be a mapping, is None"),
+        ({"views": 0}, "views: must be at least 1, is 0"),
+        (
+            {"camera": {"near": {"change": "near", "values": [], "says": ""}}},
+            "camera.near.values: must be a list",
+        ),
+        ({"camera": {"near": {"change": "near", "values": [1]}}}, "camera.near.says: missing"),
+        ({"camera": {"near": {"change": "near", "values": ["a"], "says": ""}}}, "camera.near.values.0: must be a num"),
     ],
 )
 def test_a_wrong_manifest(tmp_path, change, message):
@@ -214,7 +216,7 @@ def test_frames_of_the_world():
     """Pixels of points stay as they are under a rigid motion, and are mirrored by the mirrored camera."""
     double = lambda batch: {k: v.double() if v.is_floating_point() else v for k, v in batch.items()}
     batch = double(synthetic_batch(size=13))
-    up, middle = torch.tensor([0.0, 1, 0]).double(), torch.tensor([1.0, 2, 3]).double()
+    up, middle = np.array([0.0, 1, 0]), np.array([1.0, 2, 3])
     pixels = lambda b: visible_pixels(b["point_position"], b["point_visible"], **{name: b[name] for name in PROJECTION})
     expected = pixels(batch)
     for change, value in ((FRAME["shifted"], 3.0), (FRAME["turned"], 70.0)):
