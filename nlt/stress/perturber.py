@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,36 +35,19 @@ class ViewPerturber:
         room = self.description.room
         self.middle = (self.description.camera if room is None else room).mean(0)
         self.objects = np.array([m.name != MOVING_LIGHT for m in self.scene.movables], bool)
-        self._lit = not self.objects.all()
-        if self._lit:
+        self._emitter: Any = {}  # the moving light's, if there is one
+        if not self.objects.all():
             self._emitter = mi.traverse(self.scene.mi_scene)
             self._emitter.keep([f"emitter_{MOVING_LIGHT}.emitter.radiance.value"])
 
     def place(self, index: int, change: str | None = None, value: float = 0.0) -> Camera:
-        """Put the scene into a test sample's state and return the camera. A `change` in `PLACES` is then made."""
+        """Put the scene into a test sample's state, make a change (a key of `PLACES`) and return the camera."""
         self.rng = np.random.default_rng([self._seed, self.render.index, index])
-        self.light_size, self.light_gain = 1.0, np.ones(3)
-        if self._lit:
-            self._set_light()  # before a view is chosen, because the light may hide it
+        self.set_light()  # before a view is chosen, because the light may hide it
         self.camera = self.render.place("test", index)
         if change in PLACES:
             PLACES[change](self, value)
-            if self._lit:
-                self._set_light()
-                self.scene.set_state(self.scene.state)
         return self.camera
-
-    def _set_light(self) -> None:
-        light = self.description.light
-        assert light is not None
-        size, radiance = light.size * self.light_size, light.radiance * self.light_gain
-        light = dataclasses.replace(light, size=size, radiance=radiance)
-        self.scene.description = dataclasses.replace(self.description, light=light)
-        (key,) = self._emitter.keys()
-        self._emitter[key] = mi.Color3f(radiance.tolist())
-        if is_jit():
-            dr.make_opaque(self._emitter[key])
-        self._emitter.update()
 
     def lit_points(self) -> Points:
         """Return training's points under the current light."""
@@ -77,6 +61,20 @@ class ViewPerturber:
         return self.points | {"position": position, "emission": emission}
 
     # --- the parts of changes ---
+
+    def set_light(self, size: float = 1.0, gain: float | np.ndarray = 1.0) -> None:
+        """Scale the sides and the radiance (3,) of the moving light, if there is one."""
+        self.light_size, self.light_gain = size, np.broadcast_to(gain, 3)
+        for key in self._emitter.keys():  # noqa: SIM118
+            light = self.description.light
+            assert light is not None
+            light = dataclasses.replace(light, size=light.size * size, radiance=light.radiance * gain)
+            self.scene.description = dataclasses.replace(self.description, light=light)
+            self._emitter[key] = mi.Color3f(light.radiance.tolist())
+            if is_jit():
+                dr.make_opaque(self._emitter[key])
+            self._emitter.update()
+            self.scene.set_state(self.scene.state)
 
     def move(self, translation: np.ndarray, present: np.ndarray) -> None:
         """Set another state, and another camera where the old one no longer shows the room."""
@@ -139,21 +137,6 @@ def light_lowered(view: ViewPerturber, metres: float) -> None:
     moved = state.translation.astype(float)
     moved[light] += view.up * (view.scene.movables[light].box[0] @ view.up - moved[light] @ view.up - metres)
     view.move(moved, state.present)
-
-
-def light_size(view: ViewPerturber, factor: float) -> None:
-    """Scale the light's sides by `factor`, at the same power."""
-    view.light_size, view.light_gain = factor, np.full(3, factor**-2.0)
-
-
-def light_colour(view: ViewPerturber, share: float) -> None:
-    """Mix the light with red of the same mean."""
-    view.light_gain = 1 - share + share * _RED
-
-
-def light_power(view: ViewPerturber, factor: float) -> None:
-    """Multiply the light's radiance by `factor`."""
-    view.light_gain = np.full(3, factor)
 
 
 def turned_from_light(view: ViewPerturber, degrees: float) -> None:
@@ -226,11 +209,6 @@ def grazing(view: ViewPerturber, degrees: float) -> None:
             return
 
 
-def field_of_view(view: ViewPerturber, degrees: float) -> None:
-    """Set another horizontal field of view."""
-    view.set_lens(fov=degrees)
-
-
 def corner(view: ViewPerturber, metres: float) -> None:
     """Put the camera this far from both walls of a corner, at its height, aimed at the room's middle.
 
@@ -245,30 +223,32 @@ def corner(view: ViewPerturber, metres: float) -> None:
     view.camera = min(cameras, key=lambda camera: view.render.views.shares(camera).back)
 
 
-def resolution(view: ViewPerturber, factor: float) -> None:
-    """Multiply the image's width and height by `factor`."""
-    view.set_lens(width=factor, height=factor)
-
-
-def aspect(view: ViewPerturber, ratio: float) -> None:
-    """Make the image `ratio` times as wide as high, with as many pixels."""
-    view.set_lens(width=ratio**0.5, height=ratio**-0.5)
-
-
-_LIGHT_CHANGES = (light_lowered, light_size, light_colour, light_power, turned_from_light)
-_OBJECT_CHANGES = (object_outside, objects_removed, objects_crowded)
-_CAMERA_CHANGES = (near, grazing, field_of_view, corner, resolution, aspect)
-PLACES: dict[str, Callable[[ViewPerturber, float], None]] = {
-    change.__name__: change for change in (*_LIGHT_CHANGES, *_OBJECT_CHANGES, *_CAMERA_CHANGES)
+_LIGHT_CHANGES: dict[str, Callable[[ViewPerturber, float], None]] = {
+    "light_lowered": light_lowered,
+    "light_size": lambda view, factor: view.set_light(size=factor, gain=factor**-2.0),  # of the same power
+    "light_colour": lambda view, share: view.set_light(gain=1 - share + share * _RED),  # mixed with red
+    "light_power": lambda view, factor: view.set_light(gain=factor),
+    "turned_from_light": turned_from_light,
 }
+_OBJECT_CHANGES = {
+    "object_outside": object_outside, "objects_removed": objects_removed, "objects_crowded": objects_crowded,
+}  # fmt: skip
+PLACES = _LIGHT_CHANGES | _OBJECT_CHANGES | {
+    "near": near,
+    "grazing": grazing,
+    "field_of_view": lambda view, degrees: view.set_lens(fov=degrees),
+    "corner": corner,
+    "resolution": lambda view, factor: view.set_lens(width=factor, height=factor),
+    "aspect": lambda view, ratio: view.set_lens(width=ratio**0.5, height=ratio**-0.5),  # width over height
+}  # fmt: skip
 
 
 def lacks(spec: DatasetSpec, scene: int, change: str) -> str | None:
     """Return what a change needs and a scene lacks; None if the change is possible."""
     description = spec.descriptions[scene]
-    if (change == "second_light" or PLACES.get(change) in _LIGHT_CHANGES) and spec.experiment != "moving_lights":
+    if change in (*_LIGHT_CHANGES, "second_light") and spec.experiment != "moving_lights":
         return "a moving light"
-    if PLACES.get(change) in _OBJECT_CHANGES and not (description.objects and spec.experiment != "static"):
+    if change in _OBJECT_CHANGES and not (description.objects and spec.experiment != "static"):
         return "movable objects"
     if change == "corner" and description.room is None:
         return f"a room in {description.file}"
