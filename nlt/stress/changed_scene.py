@@ -34,7 +34,6 @@ class ChangedScene(Scene):
         self, description: SceneDescription, experiment: str, change: str, value: float, points: Points, seed: int
     ) -> None:
         self._change, self._value, self._points = change, value, points
-        self._touched: frozenset[str] = frozenset()  # shapes whose points change
         self._axes: dict[str, np.ndarray] = {}  # by thinned shape, the middle of its object
         self._second = np.zeros(3)  # offset from the moving light at rest to the second one
         self.rng = np.random.default_rng(seed)
@@ -43,9 +42,10 @@ class ChangedScene(Scene):
     def _assemble(self, meshes: dict[str, Any]) -> None:
         self._names = list(meshes)
         changed = MESHES[self._change](self, meshes, self._value)
+        self._changed = [name for name in meshes if name in changed]
         units = self.description.units_per_metre
         # Drop the replaced surfaces entirely: kernels would be compiled with any that stay alive.
-        self.shapes |= {name: read_shape(mesh, units, False) for name, mesh in changed.items() if name in meshes}
+        self.shapes |= {name: read_shape(changed[name], units, False) for name in self._changed}
         super()._assemble(meshes | changed)
 
     def objects(self, meshes: dict[str, Any]) -> list[list[str]]:
@@ -70,12 +70,12 @@ class ChangedScene(Scene):
         mine = self._points["shape"] == self._names.index(name)
         return self._points["albedo"][mine].mean(0) if mine.any() else np.full(3, 0.5)
 
-    def moved_points(self, points: Points) -> Points:
+    def moved_points(self) -> Points:
         """Return training's points with the attributes of this scene."""
-        points = {name: array.copy() for name, array in points.items()}
-        for k, name in enumerate(self._names):
-            mine, shape = np.flatnonzero(points["shape"] == k), self.shapes[name]
-            if not len(mine) or name not in self._touched:
+        points = {name: array.copy() for name, array in self._points.items()}
+        for name in self._changed:
+            mine, shape = np.flatnonzero(points["shape"] == self._names.index(name)), self.shapes[name]
+            if not len(mine):
                 continue
             if self._change == "mesh_thinner":
                 points["position"][mine] = self._thin(points["position"][mine], name)
@@ -94,61 +94,62 @@ class ChangedScene(Scene):
             points["object"][second] = -1
         return points
 
-    def surfaces(self, meshes: dict[str, Any], bsdfs: dict[str, Any]) -> dict[str, Any]:
-        """Return the meshes of these shapes with new BSDFs."""
-        self._touched = frozenset(bsdfs)
-        live = {str(bsdf): mi.load_dict(bsdf) for bsdf in bsdfs.values()}  # equal BSDFs share an instance
-        return {name: live_mesh(name, read_triangles(meshes[name]), live[str(bsdf)]) for name, bsdf in bsdfs.items()}
-
     def _thin(self, position: np.ndarray, name: str) -> np.ndarray:
         """Return positions in metres, drawn towards the vertical axis of the shape's object."""
         across = np.where(self.description.up == 0, self._value, 1.0)
         return (position - self._axes[name]) * across + self._axes[name]
 
 
-def _roughness(scene: ChangedScene, meshes: dict[str, Any], alpha: float) -> dict[str, Any]:
+def _with_surfaces(meshes: dict[str, Any], bsdfs: dict[str, Any]) -> dict[str, Any]:
+    """Return the meshes that are keys of `bsdfs`, with these BSDFs."""
+    live = {str(bsdf): mi.load_dict(bsdf) for bsdf in bsdfs.values()}  # equal BSDFs share an instance
+    return {name: live_mesh(name, read_triangles(meshes[name]), live[str(bsdf)]) for name, bsdf in bsdfs.items()}
+
+
+# --- the changes, each with its value; they return the changed and added meshes ---
+
+
+def roughness(scene: ChangedScene, meshes: dict[str, Any], alpha: float) -> dict[str, Any]:
     """Give every object the same surface: 1 is diffuse, 0 a mirror, values between are rough metal."""
     names = scene.some_objects(meshes, 1)
     if alpha == 1:
-        return scene.surfaces(meshes, {name: _diffuse(scene.mean_albedo(name)) for name in names})
+        return _with_surfaces(meshes, {name: _diffuse(scene.mean_albedo(name)) for name in names})
     kind = {"type": "roughconductor", "alpha": alpha} if alpha else {"type": "conductor"}
     metal = {**kind, "material": "none", "specular_reflectance": {"type": "rgb", "value": [_METAL] * 3}}
-    return scene.surfaces(meshes, {name: {"type": "twosided", "inner": metal} for name in names})
+    return _with_surfaces(meshes, {name: {"type": "twosided", "inner": metal} for name in names})
 
 
-def _albedo(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
+def albedo(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
     """Make every shape of an object diffuse, its mean albedo mixed with a random saturated colour."""
     bsdfs = {}
     for name in scene.some_objects(meshes, 1):
         colour = np.where(np.eye(3)[scene.rng.integers(3)] > 0, 0.9, 0.05)
         bsdfs[name] = _diffuse((1 - share) * scene.mean_albedo(name) + share * colour)
-    return scene.surfaces(meshes, bsdfs)
+    return _with_surfaces(meshes, bsdfs)
 
 
-def _glass(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
+def glass(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
     """Turn a share of the objects into glass."""
     names = scene.some_objects(meshes, share)
-    return scene.surfaces(meshes, {name: {"type": "dielectric", "int_ior": 1.5} for name in names})
+    return _with_surfaces(meshes, {name: {"type": "dielectric", "int_ior": 1.5} for name in names})
 
 
-def _replaced(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
+def mesh_replaced(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
     """Replace every shape of a share of the objects by a knot with its bounding box and BSDF."""
-    names, knot, changed = scene.some_objects(meshes, share), _knot(), {}
-    scene._touched = frozenset(names)
-    for name in names:
+    knot, changed = _knot(), {}
+    for name in scene.some_objects(meshes, share):
         old = read_triangles(meshes[name]).vertices
         vertices = old.min(0) + knot.vertices * (old.max(0) - old.min(0))
         changed[name] = live_mesh(name, dataclasses.replace(knot, vertices=vertices), meshes[name].bsdf())
     return changed
 
 
-def _thinner(scene: ChangedScene, meshes: dict[str, Any], factor: float) -> dict[str, Any]:
+def mesh_thinner(scene: ChangedScene, meshes: dict[str, Any], factor: float) -> dict[str, Any]:
     """Draw every object towards its vertical axis."""
     changed = {}
     for group in scene.objects(meshes):
         vertices = np.concatenate([scene.shapes[name].vertices for name in group])
         scene._axes |= dict.fromkeys(group, (vertices.min(0) + vertices.max(0)) / 2)
-    scene._touched = frozenset(scene._axes)
     units = scene.description.units_per_metre
     for name in scene._axes:
         old = read_triangles(meshes[name])
@@ -157,13 +158,12 @@ def _thinner(scene: ChangedScene, meshes: dict[str, Any], factor: float) -> dict
     return changed
 
 
-def _second_light(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
+def second_light(scene: ChangedScene, meshes: dict[str, Any], share: float) -> dict[str, Any]:
     """Give a share of the power to a second light in a corner of the first one's box."""
     light, up = scene.description.light, scene.description.up
     assert light is not None
-    scene.description = dataclasses.replace(
-        scene.description, light=dataclasses.replace(light, radiance=light.radiance * (1 - share))
-    )
+    dimmed = dataclasses.replace(light, radiance=light.radiance * (1 - share))
+    scene.description = dataclasses.replace(scene.description, light=dimmed)
     vertices, faces = light_quad(scene.description)
     scene._second = light.box[0] - light.centre - _BELOW * up
     radiance = {"type": "rgb", "value": (light.radiance * share).tolist()}
@@ -173,12 +173,7 @@ def _second_light(scene: ChangedScene, meshes: dict[str, Any], share: float) -> 
 
 
 MESHES: dict[str, Callable[[ChangedScene, dict[str, Any], float], dict[str, Any]]] = {
-    "roughness": _roughness,
-    "albedo": _albedo,
-    "glass": _glass,
-    "mesh_replaced": _replaced,
-    "mesh_thinner": _thinner,
-    "second_light": _second_light,
+    change.__name__: change for change in (roughness, albedo, glass, mesh_replaced, mesh_thinner, second_light)
 }
 
 
@@ -187,20 +182,17 @@ def _diffuse(albedo: np.ndarray) -> dict[str, Any]:
     return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": reflectance}}
 
 
-def _knot(along: int = 96, around: int = 12) -> Triangles:
+def _knot() -> Triangles:
     """Return a tube around a trefoil knot, in the unit cube."""
+    along, around = 96, 12
     t, s = (g.ravel() for g in np.meshgrid(*(2 * np.pi * np.arange(n + 1) / n for n in (along, around)), indexing="ij"))
     curve = lambda t: np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], 1)
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
     tangent = unit(curve(t + 1e-4) - curve(t - 1e-4))
     side = unit(np.cross(tangent, [0.0, 0.0, 1.0]))
-    normals = np.cos(s)[:, None] * side + np.sin(s)[:, None] * np.cross(side, tangent)
-    vertices = curve(t) + 0.5 * normals
+    vertices = curve(t) + 0.5 * (np.cos(s)[:, None] * side + np.sin(s)[:, None] * np.cross(side, tangent))
     vertices = (vertices - vertices.min(0)) / (vertices.max(0) - vertices.min(0))
     first = (np.arange(along)[:, None] * (around + 1) + np.arange(around)).reshape(-1, 1)
     below = first + around + 1
-    faces = np.concatenate([np.hstack([first, first + 1, below]), np.hstack([below, first + 1, below + 1])])
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    if (np.cross(b - a, c - a) * normals[faces[:, 0]]).sum() < 0:
-        faces = faces[:, ::-1]
+    faces = np.concatenate([np.hstack([below, first + 1, first]), np.hstack([below + 1, first + 1, below])])
     return Triangles(vertices, faces, None, np.stack([t, s], 1) / (2 * np.pi))

@@ -179,7 +179,7 @@ def _points(perturber: ViewPerturber, view_set: ViewSet) -> Points:
         spec = perturber.render.spec
         return sample_points(perturber.scene, spec.points, spec.seed + view_set.severity)
     if isinstance(perturber.scene, ChangedScene):
-        return perturber.scene.moved_points(perturber.points)
+        return perturber.scene.moved_points()
     return perturber.lit_points()
 
 
