@@ -54,14 +54,10 @@ def stress(
     """Train the methods as `nlt compare` does, render the suites and evaluate; existing results are kept.
 
     Args:
-        config: a config in configs/compare, by name or path.
+        config, scale, data, methods: the comparison, as in `Comparison.load`.
         out: the results' directory; None for results/ and the config's name.
-        scale: a config in configs/scale in place of the comparison's.
-        data: a config in configs/data in place of the comparison's.
-        methods: the methods, in place of the comparison's.
         suites: names out of `SUITES`; None for all.
-        manifest: the manifest of the suites in configs/stress, by name or path.
-        views: the number of views of each scene, in place of the manifest's.
+        manifest, views: the manifest of the suites, as in `load_suites`.
 
     Returns:
         The directory of the stress results.

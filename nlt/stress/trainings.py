@@ -26,13 +26,13 @@ SEED, RATE, PRECISION, CORRUPTED = "seed", "learning rate", "precision", "corrup
 class Corruption(L.Callback):
     """Adds fireflies to the targets of a share of the samples, the same ones in every epoch."""
 
-    def __init__(self, share: float, factor: float = 1e4, one_in: int = 100) -> None:
-        self.every, self.factor, self.one_in = max(1, round(1 / share)), factor, one_in
+    def __init__(self, share: float) -> None:
+        self.every = max(1, round(1 / share))
 
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        """Multiply the radiance of one in `one_in` pixels by `factor`."""
+        """Multiply the radiance of one in 100 pixels by 10,000."""
         for k in torch.nonzero(batch["index"] % self.every == 0).flatten().tolist():
-            batch["noisy"][k].view(3, -1)[:, k % self.one_in :: self.one_in] *= self.factor
+            batch["noisy"][k].view(3, -1)[:, k % 100 :: 100] *= 1e4
 
 
 def train_suite(
@@ -48,7 +48,9 @@ def train_suite(
     Raises:
         UserError: the scale has no trainer.max_steps.
     """
-    kept = {(row["method"], row["run"]): row["error"] for row in _finished_rows(directory / TRAININGS)}
+    path = directory / TRAININGS
+    finished = [row for row in read_rows(path) if row["status"] == OK] if path.exists() else []
+    known = {row["run"]: row["error"] for row in finished}
     jobs: list[tuple[dict[str, Any], Training]] = []
     for method in _one_per_kind(comparison):
         config = read_configs(comparison.configs(method))
@@ -59,20 +61,15 @@ def train_suite(
     failures = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
     rows = []
     for row, training in jobs:
-        row |= {"status": FAILED if training in failures else OK, "message": failures.get(training, "")}
-        row["run"] = training.run.name
-        known = kept.get((training.method, training.run.name))
+        run = training.run.name
+        row |= {"status": FAILED if training in failures else OK, "message": failures.get(training, ""), "run": run}
         try:
             if row["status"] == OK:
-                row["error"] = error(training.load(device)[0]) if known is None else known
+                row["error"] = known[run] if run in known else error(training.load(device)[0])
         except DivergedError as problem:
             row |= {"status": DIVERGED, "message": str(problem)}
         rows.append(row)
-    write_rows(directory / TRAININGS, rows)
-
-
-def _finished_rows(path: Path) -> list[dict[str, Any]]:
-    return [row for row in read_rows(path) if row["status"] == OK] if path.exists() else []
+    write_rows(path, rows)
 
 
 def _one_per_kind(comparison: Comparison) -> list[str]:
@@ -81,10 +78,9 @@ def _one_per_kind(comparison: Comparison) -> list[str]:
     for method in comparison.methods:
         if not build_if_untrained(method):
             model = read_configs([comparison.configs(method)[1]])["model"]
-            kind = {
-                k: v for k, v in model.get("init_args", {}).items() if not isinstance(v, int) or isinstance(v, bool)
-            }
-            first_of_kind.setdefault(f"{model['class_path']} {kind}", method)
+            init_args = model.get("init_args", {})
+            inputs = {name: value for name, value in init_args.items() if type(value) is not int}
+            first_of_kind.setdefault(f"{model['class_path']} {inputs}", method)
     return list(first_of_kind.values())
 
 

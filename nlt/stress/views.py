@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -26,19 +27,17 @@ from nlt.stress.rendering import DRAWS, ViewSet, read_views
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
 
 
+@dataclass
 class SuiteViews:
     """The rendered suites as batches, and the evaluation of methods on them."""
 
-    def __init__(
-        self,
-        directory: AnyPath,
-        spec: DatasetSpec,
-        suites: Suites,
-        sets: list[ViewSet],
-        device: torch.device,
-    ) -> None:
-        self.directory, self.spec, self.suites, self.device = directory, spec, suites, device
-        self.view_sets = sets
+    directory: AnyPath
+    spec: DatasetSpec
+    suites: Suites
+    view_sets: list[ViewSet]
+    device: torch.device
+
+    def __post_init__(self) -> None:
         self.batch = cache(self._batch)
 
     def _batch(self, view_set: ViewSet, points: Points | None = None) -> Batch:
@@ -79,7 +78,7 @@ class SuiteViews:
                 yield name, severity, [self.batch(s) for s in mine if (s.ladder, s.severity) == (name, severity)]
             return
         hparams: dict[str, Any] = getattr(method, "hparams", {})
-        own = dict(hparams)
+        own = dict(hparams)  # to be restored after the denoisers are given another number of pixels
         for (owner, name), ladder in self.suites.ladders.items():
             if owner == suite and (method is None or _reads(method, ladder.change)):
                 for severity, value in enumerate(ladder.values, 1):
