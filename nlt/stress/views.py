@@ -177,9 +177,10 @@ def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: 
             before_at, after_at = (
                 np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
             )
-            nearest = torch.from_numpy(cKDTree(before_at).query(after_at)[1])
+            distance, nearest = cKDTree(before_at).query(after_at)
+            nearest = np.where(distance < 1e6, nearest, np.arange(count))  # objects without former points keep rows
             rows = module.table.weight.data[scene * count : (scene + 1) * count]
-            rows[:] = rows[nearest.to(rows.device)]
+            rows[:] = rows[torch.from_numpy(nearest).to(rows.device)]
     return method
 
 
