@@ -220,7 +220,7 @@ def test_what_would_take_too_long_is_skipped_and_said(arguments, tmp_path, monke
         (["--seconds", "0"], ("--seconds",)),
         (["--ckpt", "none.ckpt"], ("--ckpt", "one method")),
         (["--methods", "cnn", "--ckpt", "none.ckpt"], ("none.ckpt", "cannot be read")),
-        (["--scale", "none"], ("none.yaml", "cannot be read")),
+        (["--scale", "none"], ("none.yaml", "No such file")),
     ],
 )
 def test_mistakes(arguments, more, words, tmp_path, capfd):

@@ -424,7 +424,7 @@ def test_budget(space, monkeypatch, capsys, slower):
         ({"minutes": 0}, "minutes: must be above 0"),
         ({"minutes": 1e-3}, "--minutes: 0.001 are too few"),
         ({"seeds": 0}, "seeds: must be above 0"),
-        ({"scale": "none"}, "cannot be read"),
+        ({"scale": "none"}, "No such file"),
         ({"data": None}, "data: must be a text"),
     ],
 )
