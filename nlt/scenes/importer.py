@@ -6,6 +6,8 @@ import re
 import tempfile
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from nlt.errors import UserError
 from nlt.scenes import mitsuba_xml
 from nlt.scenes.meshes import bsdf, curved, emitter, live_mesh
 from nlt.scenes.mitsuba_xml import LAMP_RADIUS, unique
-from nlt.scenes.model import Material, Model, Triangles, named_files, read_gltf, read_obj
+from nlt.scenes.model import Material, Model, named_files, read_gltf, read_obj
 
 SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 
@@ -26,7 +28,6 @@ SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 class Imported:
     """A loaded file. `warnings` lists what was lost, `camera` (4, 4) is its sensor's pose and `up` its up axis."""
 
-    path: Path
     scene: Any
     warnings: tuple[str, ...]
     camera: np.ndarray | None = None
@@ -65,18 +66,18 @@ def check_missing(path: Path, missing: list[str]) -> None:
 def _read_xml(path: Path) -> Imported:
     document = mitsuba_xml.read(path)
     check_missing(path, document.missing)
-    warnings = document.warnings
-    with tempfile.TemporaryDirectory() as folder:
+    pose = None if document.sensor is None else document.sensor.find("transform")
+    with tempfile.TemporaryDirectory() as folder, _reporting(path, document.warnings):
         for shape in document.root.findall("shape"):
             if shape.get("type") in mitsuba_xml.ANALYTIC:
                 _to_mesh_file(shape, Path(folder))
-        scene = _instantiate(path, ET.tostring(document.root, encoding="unicode"), warnings)
-    camera = up = None
-    if document.sensor is not None and document.sensor.find("transform") is not None:
-        camera = _matrix(document.sensor.find("transform"))
+        scene = _instantiate(document.root)
+        camera = None if pose is None else _pose(pose)
+    up = None
+    if camera is not None:
         axis = int(np.abs(camera[:3, 1]).argmax())
         up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
-    return Imported(path, scene, _format_warnings(warnings), camera, up)
+    return Imported(scene, _format_warnings(document.warnings), camera, up)
 
 
 def _read_model(path: Path) -> Imported:
@@ -84,17 +85,17 @@ def _read_model(path: Path) -> Imported:
     is_obj = path.suffix.lower() == ".obj"
     model = read_obj(path) if is_obj else read_gltf(path)
     scene = _build(model)
-    return Imported(path, scene, _format_warnings(model.warnings), up=None if is_obj else "y")
+    return Imported(scene, _format_warnings(model.warnings), up=None if is_obj else "y")
 
 
 def _build(model: Model) -> Any:
     """Build a scene of a model's parts, under their names, with a small sphere for every lamp."""
     parts = list(model.parts)
     for name, position, intensity in model.lamps:
-        ball = curved("sphere")
-        ball = Triangles(ball.vertices * LAMP_RADIUS + position, ball.faces, ball.normals, ball.uv)
+        placed = np.diag([LAMP_RADIUS, LAMP_RADIUS, LAMP_RADIUS, 1])
+        placed[:3, 3] = position
         radiance = tuple(intensity / (np.pi * LAMP_RADIUS**2))
-        parts.append((name, ball, Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
+        parts.append((name, curved("sphere").moved(placed), Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
     bsdfs: dict[int, Any] = {}  # one per material, because each instance costs tracing time
     meshes: dict[str, Any] = {}
     for name, triangles, material in parts:
@@ -120,53 +121,58 @@ class _WarningCounter(mi.Appender):
         super().__init__()
         self.counts = counts
 
-    def append(self, level: Any, text: str) -> None:
-        plugin = re.search(r'in (\w+) plugin of type "(\w+)"', text)
-        names = re.findall(r'^ +- \w+ "(\w+)"', text, re.MULTILINE)
-        for name in names if plugin is not None else ():
-            assert plugin is not None
-            self.counts[f"{name} of {plugin[1]} {plugin[2]} is ignored: Mitsuba 3 does not know it"] += 1
-        if not names and level >= mi.LogLevel.Warn:
+    def append(self, _: Any, text: str) -> None:
+        if plugin := re.search(r'in (\w+) plugin of type "(\w+)"', text):
+            for name in re.findall(r'^ +- \w+ "(\w+)"', text, re.MULTILINE):
+                self.counts[f"{name} of {plugin[2]} {plugin[1]} is ignored: Mitsuba 3 does not know it"] += 1
+        else:
             self.counts[re.sub(r"^\S+ \S+ \w+ +\[\w+(\.cpp:\d+)?\] ", "", " ".join(text.split()))] += 1
 
     def log_progress(self, *_: Any) -> None: ...
 
 
-def _instantiate(path: Path, xml: str, warnings: Counter[str]) -> Any:
-    """Instantiate a scene with Mitsuba's parser, which upgrades old names. Shapes are not merged and keep their ids."""
+@contextmanager
+def _reporting(path: Path, warnings: Counter[str]) -> Iterator[None]:
+    """Count Mitsuba's warnings and convert its errors to UserErrors for the duration of the context."""
+    logger: Any = mi.logger()  # type: ignore[operator]
+    appenders, level = [logger.appender(k) for k in range(logger.appender_count())], logger.log_level()
+    logger.clear_appenders()
+    logger.add_appender(_WarningCounter(warnings))
+    logger.set_log_level(mi.LogLevel.Warn)
+    try:
+        yield
+    except RuntimeError as error:
+        places = r"\[[\w.:]+\] |(At|while loading) string \(line \d+, col \d+\): "
+        text = re.sub(places, "", " ".join(str(error).split()))
+        raise UserError(f"{path}: Mitsuba 3 cannot load it; edit it to what Mitsuba 3 has: {text}") from None
+    finally:
+        logger.set_log_level(level)
+        logger.clear_appenders()
+        for appender in appenders:
+            logger.add_appender(appender)
+
+
+def _parse(root: ET.Element) -> tuple[Any, Any]:
+    """Return the configuration and the result of Mitsuba's parser. Shapes are not merged and keep their ids."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     config.merge_equivalent = config.merge_meshes = False
     config.unused_properties = mi.LogLevel.Warn
-    logger: Any = mi.logger()  # type: ignore[operator]
-    before = [logger.appender(k) for k in range(logger.appender_count())]
-    logger.clear_appenders()
-    logger.add_appender(_WarningCounter(warnings))
-    try:
-        state = mi.parser.parse_string(config, xml)
-        mi.parser.transform_all(config, state)
-        scene = mi.parser.instantiate(config, state)
-    except RuntimeError as error:
-        text = re.sub(
-            r"\[\w+\.cpp:\d+\] |(At|while loading) string \(line \d+, col \d+\): ", "", " ".join(str(error).split())
-        )
-        raise UserError(f"{path}: Mitsuba cannot load it: {text}") from None
-    finally:
-        logger.clear_appenders()
-        for appender in before:
-            logger.add_appender(appender)
-    return scene
+    return config, mi.parser.parse_string(config, ET.tostring(root, encoding="unicode"))
 
 
-def _matrix(transform: ET.Element | None) -> np.ndarray:
+def _instantiate(root: ET.Element) -> Any:
+    """Instantiate a scene with Mitsuba's parser, which upgrades old names."""
+    config, state = _parse(root)
+    mi.parser.transform_all(config, state)
+    return mi.parser.instantiate(config, state)
+
+
+def _pose(transform: ET.Element) -> np.ndarray:
     """Return the matrix (4, 4) of a `<transform>`, as Mitsuba reads it."""
-    if transform is None:
-        return np.eye(4)
-    xml = ET.Element("scene", version=mitsuba_xml.OLD)
-    sensor = ET.SubElement(xml, "sensor", type="perspective")
-    sensor.append(transform)
-    state = mi.parser.parse_string(mi.parser.ParserConfig(str(mi.variant())), ET.tostring(xml, encoding="unicode"))
-    name = transform.get("name", "")
-    return np.array(state.nodes[1].props[name].matrix, float).reshape(4, 4)
+    root = ET.Element("scene", version=mitsuba_xml.OLD)
+    ET.SubElement(root, "sensor", type="perspective").append(transform)
+    _, state = _parse(root)
+    return np.array(state.nodes[1].props[transform.get("name", "")].matrix, float).reshape(4, 4)
 
 
 def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
@@ -175,16 +181,12 @@ def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
     place = [c for c in shape if c.tag in ("transform", "point", "float")]
     root = ET.Element("scene", version=mitsuba_xml.OLD)
     ET.SubElement(root, "shape", type=kind).extend(place)
-    (probe,) = mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False).shapes()
+    (probe,) = _instantiate(root).shapes()
     if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices are not among the scene's parameters
         probe.write_ply(file)
     else:
         matrix = np.array(mi.traverse(probe)["to_world"].matrix, float).reshape(4, 4)
-        unit = curved(kind)
-        normals = unit.normals @ np.linalg.inv(matrix[:3, :3])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        vertices = unit.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        live_mesh(kind, Triangles(vertices, unit.faces, normals, unit.uv)).write_ply(file)
+        live_mesh(kind, curved(kind).moved(matrix)).write_ply(file)
     for child in place:
         shape.remove(child)
     shape.set("type", "ply")

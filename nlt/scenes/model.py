@@ -30,6 +30,16 @@ class Triangles:
     normals: np.ndarray | None = None
     uv: np.ndarray | None = None
 
+    def moved(self, matrix: np.ndarray) -> Triangles:
+        """Return the mesh transformed by a matrix (4, 4); a mirrored mesh keeps its front."""
+        linear = matrix[:3, :3]
+        determinant, normals = np.linalg.det(linear), self.normals
+        if normals is not None and abs(determinant) > 1e-20:
+            normals = normals @ np.linalg.inv(linear)
+            normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-20)
+        faces = self.faces if determinant >= 0 else self.faces[:, ::-1]
+        return Triangles(self.vertices @ linear.T + matrix[:3, 3], faces, normals, self.uv)
+
 
 @dataclass
 class Material:
@@ -117,20 +127,10 @@ def read_gltf(path: Path) -> Model:
         if uv is not None and source is not None:
             uv = _texture_transform(materials[source], uv)
         normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache.cache else None
-        model.parts.append((node, _placed(Triangles(mesh.vertices, mesh.faces, normals, uv), matrix), material))
+        triangles = Triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), normals, uv)
+        model.parts.append((node, triangles.moved(matrix), material))
     _lamps(header, model)
     return model
-
-
-def _placed(triangles: Triangles, matrix: np.ndarray) -> Triangles:
-    linear = matrix[:3, :3]
-    vertices = np.asarray(triangles.vertices, float) @ linear.T + matrix[:3, 3]
-    normals = triangles.normals
-    if normals is not None and abs(np.linalg.det(linear)) > 1e-20:
-        normals = normals @ np.linalg.inv(linear)
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-20)
-    faces = np.asarray(triangles.faces)
-    return Triangles(vertices, faces if np.linalg.det(linear) >= 0 else faces[:, ::-1], normals, triangles.uv)
 
 
 def _read_gltf(path: Path) -> tuple[dict[str, Any], bytes | None]:
