@@ -7,18 +7,18 @@ else in nlt, they are in metres.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
-import yaml
+from pydantic import AfterValidator, Field, FiniteFloat, field_validator, model_validator
 
+from nlt.config import Settings, parse, read_configs
 from nlt.errors import UserError
 from nlt.paths import config_names, find_config, scenes_root
-from nlt.scenes.sources import scene_files
+from nlt.scenes import mitsuba_xml
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
@@ -28,7 +28,6 @@ TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that render the ima
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
 MOVING_LIGHT = "moving_light"  # the light's name as a movable object, and its shape id
 STATIC = "static"  # the name of the parts that never move
-UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 BUILTIN = "builtin:"
 
 
@@ -111,148 +110,125 @@ class SceneDescription:
         files = [self.file]
         if self.path is None:
             files += sorted(Path(__file__).with_name("builtin").glob("*.py"))
+        elif self.path.suffix.lower() == ".xml":
+            files += sorted(set(mitsuba_xml.read(self.path).files))
         else:
-            files += scene_files(self.path)
+            from nlt.scenes.model import named_files  # imported here because most scenes do not need trimesh
+
+            files += sorted({self.path, *(f for n in named_files(self.path) if (f := self.path.parent / n).is_file())})
         total = hashlib.sha256()
         for file in files:
             total.update(hashlib.sha256(file.read_bytes()).digest())
         return total.hexdigest()
 
 
-class Section:
-    """A mapping in a file. It rejects unknown keys, and its name appears in error messages."""
+# The content of the file, lengths in scene units.
 
-    def __init__(self, file: Path, name: str, data: Any, known: tuple[str, ...]) -> None:
-        self.file, self.name = file, name
-        if not isinstance(data, Mapping):
-            raise UserError(f"{file}: {name or 'the file'} must be a mapping with the keys {', '.join(known)}")
-        for key in data:
-            if key not in known:
-                raise UserError(f"{file}: {self.field(key)}: unknown key; known are {', '.join(known)}")
-        self.data = data
+Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+FieldOfView = Annotated[float, Field(gt=0, lt=180)]  # degrees
 
-    def field(self, key: str) -> str:
-        return f"{self.name}.{key}" if self.name else str(key)
 
-    def get(self, key: str, default: Any = None) -> Any:
-        value = self.data.get(key, default)
-        if value is None:
-            raise UserError(f"{self.file}: {self.field(key)}: missing")
-        return value
+def _check_box(box: tuple[Point, Point]) -> tuple[Point, Point]:
+    if any(low > high for low, high in zip(*box, strict=True)):
+        raise ValueError(f"is empty: minimum {list(box[0])} is above maximum {list(box[1])}")
+    return box
 
-    def numbers(self, key: str, shape: tuple[int, ...], default: Any = None) -> np.ndarray:
-        try:
-            array = np.array(self.get(key, default), float)
-        except (TypeError, ValueError):
-            array = np.array(np.nan)
-        if array.shape != shape or not np.isfinite(array).all():
-            expected = "a number" if shape == () else f"numbers of shape {' x '.join(map(str, shape))}"
-            raise UserError(f"{self.file}: {self.field(key)}: must be {expected}, is {self.data.get(key)!r}")
-        return array
 
-    def positive(self, key: str, shape: tuple[int, ...] = (), default: Any = None) -> np.ndarray:
-        array = self.numbers(key, shape, default)
-        if not (array > 0).all():
-            raise UserError(f"{self.file}: {self.field(key)}: must be above zero, is {array.tolist()}")
-        return array
+_Radiance = Annotated[FiniteFloat, Field(ge=0)]
+_Box = Annotated[tuple[Point, Point], AfterValidator(_check_box)]
 
-    def degrees(self, key: str, default: float) -> float:
-        """A field of view in degrees, between 0 and 180."""
-        angle = float(self.positive(key, default=default))
-        if angle >= 180:
-            raise UserError(f"{self.file}: {self.field(key)}: must be below 180 degrees, is {angle:g}")
-        return angle
 
-    def flag(self, key: str) -> bool:
-        """A boolean, False if absent."""
-        value = self.get(key, False)
-        if not isinstance(value, bool):
-            raise UserError(f"{self.file}: {self.field(key)}: must be true or false, is {value!r}")
-        return value
+class _Corners(Settings):
+    min: Point
+    max: Point
 
-    def box(self, key: str) -> np.ndarray:
-        box = self.numbers(key, (2, 3))
-        if (box[0] > box[1]).any():
-            raise UserError(f"{self.file}: {self.field(key)}: is empty: minimum {box[0]} is above maximum {box[1]}")
-        return box
+    @model_validator(mode="after")
+    def _check(self) -> _Corners:
+        _check_box((self.min, self.max))
+        return self
 
-    def min_max(self, key: str) -> np.ndarray:
-        section = Section(self.file, self.field(key), self.get(key), ("min", "max"))
-        box = np.stack([section.numbers(end, (3,)) for end in ("min", "max")])
-        if (box[0] > box[1]).any():
-            raise UserError(f"{self.file}: {self.field(key)}: is empty: min is above max")
-        return box
+
+class _Object(Settings):
+    shapes: Annotated[tuple[str, ...], Field(min_length=1)]
+    box: _Box
+
+
+class _Light(Settings):
+    size: tuple[Positive, Positive]
+    radiance: tuple[_Radiance, _Radiance, _Radiance]
+    box: _Box
+
+    @field_validator("radiance")
+    @classmethod
+    def _shines(cls, radiance: tuple[float, ...]) -> tuple[float, ...]:
+        if not any(radiance):
+            raise ValueError("must be above 0 in at least one channel")
+        return radiance
+
+
+class _File(Settings):
+    source: str
+    name: str | None = None
+    units_per_metre: Positive = 1.0
+    up: Literal["x", "y", "z"] = "y"
+    exposure: Positive = 1.0
+    fov: FieldOfView = 70.0
+    camera: _Corners
+    look_at: _Corners | None = None
+    room: _Box | None = None
+    teacher: Teacher = "path"
+    objects: dict[str, _Object] = Field(default={})
+    moving_light: _Light | None = None
+
+    @field_validator("objects")
+    @classmethod
+    def _free_names(cls, objects: dict[str, _Object]) -> dict[str, _Object]:
+        for name in (MOVING_LIGHT, STATIC):
+            if name in objects:
+                raise ValueError(f"the name {name} is reserved; choose another one")
+        return objects
 
 
 def load_description(name: str, need_source: bool = True) -> SceneDescription:
-    """Read `configs/scenes/<name>.yaml`, or the file at the path `name`.
+    """Read the description of a scene, given by name or by path (see `find_config`).
 
     Raises:
         UserError: the file is missing or has a mistake, or its scene file is missing although `need_source`.
     """
     file = find_config("scenes", name)
-    try:
-        data = yaml.safe_load(file.read_text())
-    except FileNotFoundError:
-        known = ", ".join(config_names("scenes"))
-        raise UserError(f"{file}: no such scene description; known scenes are {known}") from None
-    except yaml.YAMLError as error:
-        raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
-    keys = (
-        *("name", "source", "units_per_metre", "up", "exposure", "fov", "camera", "look_at", "room", "teacher"),
-        *("objects", "moving_light"),
-    )
-    top = Section(file, "", data, keys)
-    scale = 1.0 / float(top.positive("units_per_metre", default=1.0))
-    up = top.get("up", "y")
-    if up not in UP:
-        raise UserError(f"{file}: up: must be one of {', '.join(UP)}, is {up!r}")
-    camera = top.min_max("camera") * scale
+    if not file.exists():
+        raise UserError(f"{file}: no such scene description; known scenes are {', '.join(config_names('scenes'))}")
+    content = {key: value for key, value in read_configs([file]).items() if value is not None}
+    read = parse(_File, content, file)
+    metres = lambda lengths: np.array(lengths, float) * (1 / read.units_per_metre)
+    corners = lambda box: metres([box.min, box.max])
+    camera, light = corners(read.camera), None
     half = camera.mean(0) + (camera - camera.mean(0)) / 2
-    teacher = top.get("teacher", "path")
-    if teacher not in TEACHERS:
-        raise UserError(f"{file}: teacher: must be one of {', '.join(TEACHERS)}, is {teacher!r}")
-    objects = []
-    entries = data.get("objects") or {}
-    if not isinstance(entries, Mapping):
-        raise UserError(f"{file}: objects: must be a mapping from names to shapes and box, is {entries!r}")
-    for key, value in entries.items():
-        if key in (MOVING_LIGHT, STATIC):
-            raise UserError(f"{file}: objects.{key}: this name is reserved; choose another name")
-        section = Section(file, f"objects.{key}", value, ("shapes", "box"))
-        shapes = section.get("shapes")
-        if not isinstance(shapes, list) or not shapes:
-            raise UserError(f"{file}: objects.{key}.shapes: must be a list of shape ids, is {shapes!r}")
-        objects.append(Movable(str(key), tuple(map(str, shapes)), section.box("box") * scale))
-    light = None
-    if data.get("moving_light") is not None:
-        section = Section(file, MOVING_LIGHT, data[MOVING_LIGHT], ("size", "radiance", "box"))
-        size = section.positive("size", (2,)) * scale
-        radiance = section.numbers("radiance", (3,))
-        if (radiance < 0).any() or not radiance.any():
-            raise UserError(f"{file}: moving_light.radiance: must be above zero, is {radiance.tolist()}")
-        light = MovingLight(size, radiance, section.box("box") * scale)
+    if (lamp := read.moving_light) is not None:
+        light = MovingLight(metres(lamp.size), np.array(lamp.radiance), metres(lamp.box))
     return SceneDescription(
-        name=str(top.get("name", file.stem)),
+        name=read.name or file.stem,
         file=file,
-        source=_find_source(file, str(top.get("source")), need_source),
-        units_per_metre=1.0 / scale,
-        up=np.array(UP[up]),
-        exposure=float(top.positive("exposure", default=1.0)),
-        fov=top.degrees("fov", default=70.0),
+        source=_find_source(file, read.source, need_source),
+        units_per_metre=read.units_per_metre,
+        up=np.eye(3)["xyz".index(read.up)],
+        exposure=read.exposure,
+        fov=read.fov,
         camera=camera,
-        look_at=top.min_max("look_at") * scale if "look_at" in data else half,
-        objects=tuple(objects),
+        look_at=half if read.look_at is None else corners(read.look_at),
+        objects=tuple(Movable(key, entry.shapes, metres(entry.box)) for key, entry in read.objects.items()),
         light=light,
-        room=top.box("room") * scale if "room" in data else None,
-        teacher=teacher,
+        room=None if read.room is None else metres(read.room),
+        teacher=read.teacher,
     )
 
 
 def _find_source(file: Path, source: str, needed: bool) -> str:
     if source.startswith(BUILTIN):
         return source
-    candidates = [Path(source)] if Path(source).is_absolute() else [file.parent / source, scenes_root() / source]
+    # An absolute path replaces both folders.
+    candidates = list(dict.fromkeys(folder / source for folder in (file.parent, scenes_root())))
     for path in candidates:
         if path.is_file():
             return str(path.resolve())

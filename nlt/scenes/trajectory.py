@@ -3,20 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
-import yaml
+from pydantic import Field
 from scipy.interpolate import PchipInterpolator
 
+from nlt.config import Settings, parse, read_configs
 from nlt.errors import UserError
 from nlt.scenes.camera import Camera
-from nlt.scenes.description import MOVING_LIGHT, SceneDescription, Section
+from nlt.scenes.description import MOVING_LIGHT, FieldOfView, Point, SceneDescription
 from nlt.scenes.state import SceneState, rest_state, sample_state
 
 TURNTABLE = "turntable"
 _INNER = 0.9  # radius of a turntable, as a fraction of the box's half size
+
+
+class _View(Settings):
+    position: Point
+    target: Point
+
+
+class _CameraPath(Settings):
+    views: Annotated[tuple[_View, ...], Field(min_length=1)]
+    closed: bool = False
+    fov: FieldOfView | None = None
+
+
+class _State(Settings):
+    seed: Annotated[int, Field(ge=0)] | None = None
+    objects: dict[str, Literal["removed"] | Point] = Field(default={})
+    light: Annotated[tuple[Point, ...], Field(min_length=1)] | None = None
+    closed: bool = False
 
 
 def turn(box: np.ndarray, up: np.ndarray, frames: int, phase: float = 0.0) -> np.ndarray:
@@ -53,24 +71,21 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
     Raises:
         UserError: the file is missing, or one of its keys is missing, unknown or not a point.
     """
-    fov = description.fov
+    fov, up = description.fov, description.up
     if path == TURNTABLE:
-        positions = turn(description.camera, description.up, frames)
-        targets = turn(description.look_at, description.up, frames, phase=0.5)
+        positions = turn(description.camera, up, frames)
+        targets = turn(description.look_at, up, frames, phase=0.5)
     else:
-        section = _read(path, ("views", "closed", "fov"))
-        views, closed = section.get("views"), section.flag("closed")
-        if not isinstance(views, list) or not views:
-            raise UserError(f"{path}: views: must be a list of mappings with a position and a target, is {views!r}")
-        keys = [Section(Path(path), f"views[{k}]", view, ("position", "target")) for k, view in enumerate(views)]
-        ends = ("position", "target")
-        positions, targets = (follow(np.stack([k.numbers(end, (3,)) for k in keys]), frames, closed) for end in ends)
-        fov = section.degrees("fov", default=fov)
+        read = parse(_CameraPath, read_configs([path]), path)
+        positions, targets = (
+            follow(np.array([getattr(view, end) for view in read.views]), frames, read.closed)
+            for end in ("position", "target")
+        )
+        fov = read.fov or fov
     for k, (position, target) in enumerate(zip(positions, targets, strict=True)):
         direction = target - position
-        if np.linalg.norm(np.cross(direction, description.up)) <= 1e-3 * np.linalg.norm(direction):
+        if np.linalg.norm(np.cross(direction, up)) <= 1e-3 * np.linalg.norm(direction):
             raise UserError(f"--camera-path: {path}: frame {k} looks straight up or down, or nowhere; move the target")
-    up = description.up
     return [Camera.look_at(p, t, up, fov, width, height) for p, t in zip(positions, targets, strict=True)]
 
 
@@ -88,60 +103,37 @@ def states(
     Raises:
         UserError: the file is missing, or does not describe a state of this scene and experiment.
     """
-    movables = description.movables(experiment)
-    names = [movable.name for movable in movables]
     if state.isdecimal():
-        base, keys, closed = sample_state(description, experiment, np.random.default_rng(int(state))), None, False
+        read = _State(seed=int(state))
     else:
-        base, keys, closed = _read_state(description, experiment, state)
-    moving = description.light
-    if moving is None or MOVING_LIGHT not in names:
-        if light or keys is not None:
-            raise UserError(f"--light: {description.name} has no moving light in the experiment {experiment}")
+        read = parse(_State, {k: v for k, v in read_configs([state]).items() if v is not None}, state)
+    base = _first_state(description, experiment, read, state)
+    if not light and read.light is None:
         return [base] * frames
+    names = [movable.name for movable in description.movables(experiment)]
+    if description.light is None or MOVING_LIGHT not in names:
+        raise UserError(f"--light: {description.name} has no moving light in the experiment {experiment}")
     if light:
-        positions = turn(moving.box, description.up, frames)
-    elif keys is not None:
-        positions = follow(keys, frames, closed)
+        positions = turn(description.light.box, description.up, frames)
     else:
-        return [base] * frames
-    row = names.index(MOVING_LIGHT)
-    moved = []
-    for position in positions:
-        translation = base.translation.copy()
-        translation[row] = position - moving.centre
-        moved.append(replace(base, translation=translation))
+        positions = follow(np.array(read.light, float), frames, read.closed)
+    moved = [replace(base, translation=base.translation.copy()) for _ in range(frames)]
+    for moment, position in zip(moved, positions, strict=True):
+        moment.translation[names.index(MOVING_LIGHT)] = position - description.light.centre
     return moved
 
 
-def _read_state(
-    description: SceneDescription, experiment: str, path: str
-) -> tuple[SceneState, np.ndarray | None, bool]:
-    section = _read(path, ("seed", "objects", "light", "closed"))
-    base, seed = rest_state(description, experiment), section.data.get("seed")
-    if seed is not None:
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise UserError(f"{path}: seed: must be a whole number of at least 0, is {seed!r}")
-        base = sample_state(description, experiment, np.random.default_rng(seed))
-    names = tuple(m.name for m in description.movables(experiment) if m.name != MOVING_LIGHT)
-    objects = Section(Path(path), "objects", section.data.get("objects") or {}, names)
-    for name, value in objects.data.items():
+def _first_state(description: SceneDescription, experiment: str, read: _State, path: str) -> SceneState:
+    """Return the state that a file describes, before its light moves."""
+    if read.seed is None:
+        state = rest_state(description, experiment)
+    else:
+        state = sample_state(description, experiment, np.random.default_rng(read.seed))
+    names = [movable.name for movable in description.movables(experiment) if movable.name != MOVING_LIGHT]
+    for name, place in read.objects.items():
+        if name not in names:
+            raise UserError(f"{path}: objects.{name}: unknown object; known are {', '.join(names)}")
         row = names.index(name)
-        base.present[row] = value != "removed"
-        base.translation[row] = objects.numbers(name, (3,)) if base.present[row] else 0
-    keys = section.data.get("light")
-    if keys is not None:
-        count = len(keys) if isinstance(keys, list) else 0
-        keys = section.numbers("light", (max(count, 1), 3))
-    return base, keys, section.flag("closed")
-
-
-def _read(path: str, known: tuple[str, ...]) -> Section:
-    """Read a YAML or JSON file (JSON is valid YAML)."""
-    try:
-        data: Any = yaml.safe_load(Path(path).read_text())
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    return Section(Path(path), "", data, known)
+        state.present[row] = place != "removed"
+        state.translation[row] = 0 if place == "removed" else place
+    return state

@@ -260,9 +260,9 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     refused([*plain, "--camera-path", "nowhere.yaml"], "nowhere.yaml", "cannot be read")
     for content, words in (
         ({}, ["views", "missing"]),
-        ({"views": [view, {"position": [0, 0, 0]}]}, ["views[1].target", "missing"]),
-        ({"views": [{**view, "up": 1}]}, ["views[0].up", "unknown"]),
-        ({"views": [{**view, "target": [0, 1]}]}, ["views[0].target", "shape 3"]),
+        ({"views": [view, {"position": [0, 0, 0]}]}, ["views.1.target", "missing"]),
+        ({"views": [{**view, "up": 1}]}, ["views.0.up", "unknown"]),
+        ({"views": [{**view, "target": [0, 1]}]}, ["views.0.target.2", "too short"]),
         ({"views": [{**view, "target": view["position"]}]}, ["frame 0"]),
         ({"views": [view], "fov": 200}, ["fov", "below 180"]),
         ({"views": [view], "closed": "no"}, ["closed", "true or false"]),
