@@ -6,8 +6,8 @@ are in scene units. In the comments below, `h` is the height of the room, usuall
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -24,6 +24,7 @@ _HEIGHT = 2.7  # metres; the height of a usual room
 _TOUCH = 1 / 135  # of h: shapes closer than this touch (2 cm)
 _LARGE = 0.65  # of the room along an axis: longer shapes are walls and built-in furniture
 _SMALL = 1 / 25  # of h: smaller shapes are handles and screws (11 cm)
+_OUTWARD = np.array([[-1], [1]])  # by which a box (2, 3) grows to all sides
 _REACH = 0.75  # of h: the largest translation of an object (2 m)
 
 
@@ -43,29 +44,51 @@ class Proposal:
 
 def propose(scene: Any, shapes: Mapping[str, Shape], up: str | None) -> Proposal:
     """Propose a description of a loaded scene; `up` is the axis that the file states, or None."""
-    because = {}
-    bounds = _box(np.concatenate([_box(s.vertices) for s in shapes.values()]))
+    because = {"up": "stated in the file"}
     if up is None:
         up, because["up"] = _guess_up(shapes), "most of the area that faces along an axis faces along this axis"
-    else:
-        because["up"] = "stated in the file"
-    axis = "xyz".index(up)
-    room, because["room"] = _room(scene, shapes, bounds, axis)
-    height = room[1, axis] - room[0, axis]
+    rays = _Rays(scene, up)
+    upright = {name: replace(shape, vertices=shape.vertices[:, rays.order]) for name, shape in shapes.items()}
+    boxes = np.stack([_box(s.vertices) for s in upright.values()])
+    bounds = _box(boxes.reshape(-1, 3))
+    room, because["room"] = _room(rays, boxes, bounds)
+    height = room[1, 2] - room[0, 2]
     unit = min(UNITS, key=lambda u: abs(np.log(height / UNITS[u] / _HEIGHT)))
     because["units_per_metre"] = (
         f"a guess: the room is {height:.4g} high, which is {height / UNITS[unit]:.2f} m if its units are {unit}"
     )
     rng = np.random.default_rng(0)
-    points = {name: _surface_points(shape, _TOUCH * height / 2, rng) for name, shape in shapes.items()}
-    objects = []
-    for names, box in _movable(scene, points, room, axis):
-        if all(shapes[n].emitter is not None for n in names):
-            continue  # the light of a window moves only with the window
-        largest = max(names, key=lambda n: float(np.prod(np.ptp(_box(points[n]), axis=0) + _TOUCH * height)))
-        objects.append(Movable(largest, tuple(names), box))
-    camera, because["camera"] = _camera(scene, room, axis)
-    return Proposal(up, UNITS[unit], bounds, room, camera, tuple(objects), _light(room, axis), because)
+    points = {name: _surface_points(shape, _TOUCH * height / 2, rng) for name, shape in upright.items()}
+    furniture = _Furniture(rays, points, room)
+    world = lambda box: box[:, np.argsort(rays.order)]
+    objects = tuple(
+        Movable(max(names, key=lambda n: furniture.volume([n])), tuple(names), world(moves))
+        for names, moves in furniture.movable()
+        if any(shapes[n].emitter is None for n in names)  # the light of a window moves only with the window
+    )
+    camera, because["camera"] = _camera(rays, room)
+    light = _light(room)
+    light = replace(light, box=world(light.box))
+    return Proposal(up, UNITS[unit], world(bounds), world(room), world(camera), objects, light, because)
+
+
+class _Rays:
+    """Casts rays in a scene, in coordinates (two horizontal axes, up). `order` are the scene's axes in this order."""
+
+    def __init__(self, scene: Any, up: str) -> None:
+        self.scene, self.order = scene, [*("xyz".index(axis) for axis in "xyz".replace(up, "")), "xyz".index(up)]
+
+    def __call__(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the distances (n,) to the first hits of rays (n, 3), inf for rays that hit nothing."""
+
+        def kernel(origin: Any, direction: Any) -> tuple:
+            return (self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))).t,)
+
+        origins, directions = np.broadcast_arrays(origins, directions)
+        back = np.argsort(self.order)
+        lanes = {"origin": ("Point3f", origins[:, back]), "direction": ("Vector3f", directions[:, back])}
+        (t,) = launch(kernel, lanes)
+        return t.astype(float)
 
 
 def _box(points: np.ndarray) -> np.ndarray:
@@ -84,20 +107,10 @@ def _guess_up(shapes: Mapping[str, Shape]) -> str:
     return max("yzx", key=lambda u: round(float(area["xyz".index(u)]), 6))
 
 
-def trace(scene: Any, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the distances (n,) to the first hits, inf for rays that hit nothing."""
-
-    def kernel(origin: Any, direction: Any) -> tuple:
-        return (scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))).t,)
-
-    (t,) = launch(kernel, {"origin": ("Point3f", origins), "direction": ("Vector3f", directions)})
-    return t.astype(float)
-
-
-def _grid(box: np.ndarray, counts: tuple[int, int, int]) -> np.ndarray:
+def _grid(box: np.ndarray, layers: tuple[int, int, int]) -> np.ndarray:
     """Cell centres (n, 3) of a regular grid in a box."""
-    axes = [box[0, k] + (box[1, k] - box[0, k]) * (np.arange(n) + 0.5) / n for k, n in enumerate(counts)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.stack(np.meshgrid(*map(np.arange, layers), indexing="ij"), axis=-1).reshape(-1, 3)
+    return box[0] + (box[1] - box[0]) * (cells + 0.5) / layers
 
 
 def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
@@ -109,48 +122,44 @@ def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
     return float(np.median(heights[(heights >= start - tolerance * highest) & (heights <= start + tolerance)]))
 
 
-def _room(scene: Any, shapes: Mapping[str, Shape], bounds: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
+def _room(rays: _Rays, boxes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, str]:
     """Measure the inside of the room: vertical rays end at floor and ceiling, horizontal rays at the walls."""
-    size, across = np.ptp(bounds, axis=0), [k for k in range(3) if k != axis]
-    boxes = np.stack([_box(s.vertices) for s in shapes.values()])
+    size = np.ptp(bounds, axis=0)
     small = (np.ptp(boxes, axis=1) < 0.4 * size.max()).all(1)
     centres = boxes[small].mean(1) if small.any() else bounds.mean(0)[None]
     low, high = np.quantile(centres, [0.02, 0.98], axis=0)
     contents = np.stack([low - 0.02 * size, high + 0.02 * size]).clip(*bounds)
     room, ended = bounds.astype(float).copy(), np.zeros((2, 3), bool)
 
-    def measure(inside: np.ndarray, axes: list[int], layers: int, tolerance: float) -> None:
+    def measure(inside: np.ndarray, axes: tuple[int, ...], layers: int, tolerance: float) -> None:
         """Set the sides of the room across `axes` if enough of the rays that start all over a box end there."""
-        counts = [24, 24, 24]
-        counts[axis] = layers
-        starts = _grid(inside, (counts[0], counts[1], counts[2]))
+        starts = _grid(inside, (24, 24, layers))
         for k in axes:
             for side, sign in enumerate((-1, 1)):
-                t = trace(scene, starts, np.tile(sign * np.eye(3)[k], (len(starts), 1)))
+                t = rays(starts, sign * np.eye(3)[k])
                 ends = (starts[:, k] + sign * t)[np.isfinite(t)]
                 if len(ends) >= len(starts) / 5:
                     room[side, k] = _level(ends, tolerance * size[k], highest=bool(side))
                     ended[side, k] = True
 
     middle = contents.copy()
-    middle[:, axis] = np.quantile(centres[:, axis], [0.4, 0.6]) + np.array([-0.01, 0.01]) * size[axis]
-    measure(middle, [axis], 3, 0.01)
-    height = np.ptp(room[:, axis])
+    middle[:, 2] = np.quantile(centres[:, 2], [0.4, 0.6]) + np.array([-0.01, 0.01]) * size[2]
+    measure(middle, (2,), 3, 0.01)
+    height = np.ptp(room[:, 2])
     between = contents.copy()
-    between[:, axis] = room[0, axis] + height * np.array([0.55, 0.9])
-    measure(between, across, 4, 0.02)
-    outward = np.array([[-1], [1]])
+    between[:, 2] = room[0, 2] + height * np.array([0.55, 0.9])
+    measure(between, (0, 1), 4, 0.02)
     # If all contents stand on one table, the rays end on it. Measure again from the whole area between the walls, and
     # keep the new height if it differs clearly.
-    before = room[:, axis].copy()
-    middle[:, across] = np.where(ended, room - 0.05 * outward * size, contents)[:, across]
-    measure(middle, [axis], 3, 0.01)
-    room[:, axis] = np.where(np.abs(room[:, axis] - before) > 0.1 * height, room[:, axis], before)
-    reach = (contents + 2 * outward * height).clip(*bounds)
-    room[:, across] = np.where(ended, room, reach)[:, across]
-    names = [[f"{sign}{letter} wall" for letter in "xyz"] for sign in "-+"]
-    names[0][axis], names[1][axis] = "floor", "ceiling"
-    open_sides = [names[side][k] for k in (axis, *across) for side in (0, 1) if not ended[side, k]]
+    before = room[:, 2].copy()
+    middle[:, :2] = np.where(ended, room - 0.05 * _OUTWARD * size, contents)[:, :2]
+    measure(middle, (2,), 3, 0.01)
+    room[:, 2] = np.where(np.abs(room[:, 2] - before) > 0.1 * height, room[:, 2], before)
+    reach = (contents + 2 * _OUTWARD * height).clip(*bounds)
+    room[:, :2] = np.where(ended, room, reach)[:, :2]
+    sides = {"floor": (0, 2), "ceiling": (1, 2)}
+    sides |= {f"{'-+'[side]}{'xyz'[rays.order[k]]} wall": (side, k) for k in (0, 1) for side in (0, 1)}
+    open_sides = [name for name, side in sides.items() if not ended[side]]
     reason = "where rays from the middle end"
     return room, reason + (f"; no rays end at the {', '.join(open_sides)}" if open_sides else "")
 
@@ -166,70 +175,163 @@ def _surface_points(shape: Shape, spacing: float, rng: np.random.Generator) -> n
     return np.concatenate([shape.vertices, (1 - root) * a + root * (1 - other) * b + root * other * c])
 
 
-def _movable(
-    scene: Any, points: Mapping[str, np.ndarray], room: np.ndarray, axis: int
-) -> list[tuple[list[str], np.ndarray]]:
-    """Return groups of shapes that touch, each with its box of translations, the largest first.
+class _Furniture:
+    """Finds groups of shapes that can move.
 
-    A group is built in if it is as long as the room, if nothing carries it, or if it cannot move away from a wall. It
-    then loses its largest shape, and the remaining shapes are grouped again.
+    Args:
+        points: points (n, 3) on each shape, up along the last axis.
+        room: the inside of the room (2, 3).
     """
-    height, size = room[1, axis] - room[0, axis], np.ptp(room, axis=0)
-    level = np.arange(3) != axis
-    boxes = {name: _box(p) for name, p in points.items()}
-    around = lambda names: _box(np.concatenate([boxes[n] for n in names]))
-    volume = lambda names: float(np.prod(np.ptp(around(names), axis=0) + _TOUCH * height))
-    too_long = lambda names: bool((np.ptp(around(names), axis=0) > _LARGE * size)[level].any())
-    near = room + 0.1 * height * np.array([[-1], [1]])
-    pending = [n for n, b in boxes.items() if _within(b.mean(0), near) and not too_long([n])]
-    movable: list[tuple[list[str], np.ndarray]] = []
-    while pending:
-        labels = _touching([points[n] for n in pending], _TOUCH * height)
-        groups = [[n for n, label in zip(pending, labels, strict=True) if label == k] for k in np.unique(labels)]
-        pending = []
-        for names in _stacked(groups, around, too_long, height, axis):
-            if np.ptp(around(names), axis=0).max() < _SMALL * height:
-                continue
-            moves = None if too_long(names) else _translations(scene, points, names, room, axis)
-            if moves is not None and np.ptp(moves, axis=0).max() > 0.02 * height:
-                movable.append((names, moves))
-                continue
-            box = around(names)
-            at_wall = bool((np.abs(box - room) < 0.03 * height)[:, level].any())
-            if len(names) > 1 and (moves is None or at_wall):
-                pending += sorted(set(names) - {max(names, key=lambda n: volume([n]))})
-    return sorted(movable, key=lambda entry: -volume(entry[0]))
+
+    def __init__(self, rays: _Rays, points: Mapping[str, np.ndarray], room: np.ndarray) -> None:
+        self.rays, self.points, self.room = rays, points, room
+        self.boxes = {name: _box(p) for name, p in points.items()}
+        self.height = room[1, 2] - room[0, 2]
+        self.cell = self.height / 100
+
+    def around(self, names: list[str]) -> np.ndarray:
+        """Return the bounding box (2, 3) of a group."""
+        return _box(np.concatenate([self.boxes[n] for n in names]))
+
+    def volume(self, names: list[str]) -> float:
+        return float(np.prod(np.ptp(self.around(names), axis=0) + _TOUCH * self.height))
+
+    def _too_long(self, names: list[str]) -> bool:
+        return bool((np.ptp(self.around(names), axis=0) > _LARGE * np.ptp(self.room, axis=0))[:2].any())
+
+    def movable(self) -> list[tuple[list[str], np.ndarray]]:
+        """Return groups of shapes that touch, each with its box of translations, the largest first.
+
+        A group is built in if it is as long as the room, if nothing carries it, or if it cannot move away from a wall.
+        It then loses its largest shape, and the remaining shapes are grouped again.
+        """
+        low, high = self.room + 0.1 * self.height * _OUTWARD
+        middles = {name: box.mean(0) for name, box in self.boxes.items()}
+        pending = [n for n, p in middles.items() if (p >= low).all() and (p <= high).all() and not self._too_long([n])]
+        movable: list[tuple[list[str], np.ndarray]] = []
+        while pending:
+            labels = _touching([self.points[n] for n in pending], _TOUCH * self.height)
+            groups = [[n for n, label in zip(pending, labels, strict=True) if label == k] for k in np.unique(labels)]
+            pending = []
+            for names in self._stacked(groups):
+                box = self.around(names)
+                if np.ptp(box, axis=0).max() < _SMALL * self.height:
+                    continue
+                moves = None if self._too_long(names) else self._translations(names)
+                at_wall = bool((np.abs(box - self.room) < 0.03 * self.height)[:, :2].any())
+                if moves is not None and np.ptp(moves, axis=0).max() > 0.02 * self.height:
+                    movable.append((names, moves))
+                elif len(names) > 1 and (moves is None or at_wall):
+                    pending += sorted(set(names) - {max(names, key=lambda n: self.volume([n]))})
+        return sorted(movable, key=lambda entry: -self.volume(entry[0]))
+
+    def _stacked(self, groups: list[list[str]]) -> list[list[str]]:
+        """Join groups if one box lies in the other or directly on top of it, like a table's top on its frame."""
+        joined: list[list[str]] = []
+        for names in sorted(groups, key=lambda names: -self.volume(names)):
+            box = self.around(names)
+            for other in joined:
+                large = self.around(other)
+                common = np.minimum(large[1], box[1]) - np.maximum(large[0], box[0])
+                shared = common / np.maximum(np.ptp(box, axis=0), 1e-9)
+                over = large[0, 2] > box[0, 2] and box[1, 2] > large[0, 2] - 2 * _TOUCH * self.height
+                shared[2] = 1.0 if over else shared[2]
+                if (shared > 0.8).all() and not self._too_long(other + names):
+                    other += names
+                    break
+            else:
+                joined.append(list(names))
+        return joined
+
+    def _translations(self, names: list[str]) -> np.ndarray | None:
+        """Return the translations (2, 3) by which a group can slide over its support, or along its wall or ceiling.
+
+        The group collides with nothing there. None if nothing carries it.
+        """
+        room, cell, reach = self.room, self.cell, _REACH * self.height
+        own = np.concatenate([self.points[n] for n in names])
+        others = np.concatenate([np.empty((0, 3)), *(p for n, p in self.points.items() if n not in names)])
+        box = _box(own)
+        floor = _Floor(box + reach * _OUTWARD, cell)
+        blocked = floor.occupied(others[(others[:, 2] > box[0, 2] + 2 * cell) & (others[:, 2] < box[1, 2] - cell)])
+        blocked[floor.rectangle(box)] = False
+        centres = floor.centres(box[0, 2] + cell)
+        outside = ((centres < room[0]) | (centres > room[1]))[:, :2].any(1).reshape(blocked.shape)
+        carried = (self.rays(centres, np.array([0, 0, -1])) < 3 * cell).reshape(blocked.shape)
+        feet = _box(own[own[:, 2] < box[0, 2] + 2 * cell])
+        under, ring = np.zeros_like(blocked), np.zeros_like(blocked)
+        under[floor.rectangle(feet)] = True
+        ring[floor.rectangle(feet, margin=2)] = True
+        ring &= ~under & ~outside  # only around its feet: under them, rays would hit the group itself
+        if ring.any() and carried[ring].mean() > 0.5:
+            return floor.room_to_move(blocked | outside | (~carried & ~under), box, reach)
+        if box[1, 2] > room[1, 2] - 3 * cell and box[1, 2] - box[0, 2] < 0.5 * self.height:  # a lamp on the ceiling
+            return floor.room_to_move(blocked | outside, box, reach / 3)
+        return self._along_wall(floor, box, others)
+
+    def _along_wall(self, floor: _Floor, box: np.ndarray, others: np.ndarray) -> np.ndarray | None:
+        """Return the translations (2, 3) of a group that hangs on a wall, or None if it does not."""
+        room, cell = self.room, self.cell
+        thin = int(np.ptp(box, axis=0)[:2].argmin())
+        gaps = np.abs(box[:, thin] - room[:, thin])
+        if np.ptp(box[:, thin]) > 0.1 * self.height or gaps.min() > 0.06 * self.height:
+            return None
+        front = int(gaps.argmin() == 0)
+        depth = (others[:, thin] - box[front, thin]) * (1 if front else -1)
+        # Points level with its front, or slightly before it, block it.
+        level = (depth > -cell / 2) & (depth < 3 * cell) & (others[:, 2] > box[0, 2]) & (others[:, 2] < box[1, 2])
+        along = floor.centres(0)[:, 1 - thin].reshape(floor.shape)
+        blocked = (along < room[0, 1 - thin]) | (along > room[1, 1 - thin])
+        blocked |= floor.occupied(others[level]).any(thin, keepdims=True)
+        blocked[floor.rectangle(box)] = False
+        return floor.room_to_move(blocked, box, _REACH * self.height / 3, axes=(1 - thin,))
 
 
-def _within(point: np.ndarray, box: np.ndarray) -> bool:
-    return bool(((point >= box[0]) & (point <= box[1])).all())
+class _Floor:
+    """A horizontal grid of square cells that covers a box `area` (2, 3)."""
 
+    def __init__(self, area: np.ndarray, cell: float) -> None:
+        (self.low, self.high), self.cell = area[:, :2], cell
+        self.shape = np.ceil((self.high - self.low) / cell).astype(int)
 
-def _stacked(
-    groups: list[list[str]],
-    around: Callable[[list[str]], np.ndarray],
-    too_long: Callable[[list[str]], bool],
-    height: float,
-    axis: int,
-) -> list[list[str]]:
-    """Join groups if one box lies in the other or directly on top of it, like a table's top on its frame."""
-    groups = sorted(groups, key=lambda names: -float(np.prod(np.ptp(around(names), axis=0) + _TOUCH * height)))
-    joined: list[list[str]] = []
-    for names in groups:
-        box = around(names)
-        for other in joined:
-            large = around(other)
-            shared = (np.minimum(large[1], box[1]) - np.maximum(large[0], box[0])) / np.maximum(
-                np.ptp(box, axis=0), 1e-9
-            )
-            over = large[0, axis] > box[0, axis] and box[1, axis] > large[0, axis] - 2 * _TOUCH * height
-            shared[axis] = 1.0 if over else shared[axis]
-            if (shared > 0.8).all() and not too_long(other + names):
-                other += names
-                break
-        else:
-            joined.append(list(names))
-    return joined
+    def centres(self, height: float) -> np.ndarray:
+        """Return the centres (n, 3) of all cells at a height."""
+        level = self.low + (np.indices(self.shape).reshape(2, -1).T + 0.5) * self.cell
+        return np.column_stack([level, np.full(len(level), height)])
+
+    def _cells(self, points: np.ndarray) -> np.ndarray:
+        """Return the cells (n, 2) of points (n, 3)."""
+        return np.floor((points[:, :2] - self.low) / self.cell).astype(int).clip(0, self.shape - 1)
+
+    def occupied(self, points: np.ndarray) -> np.ndarray:
+        """Return whether there are points in each cell."""
+        grid = np.zeros(self.shape, bool)
+        near = ((points[:, :2] > self.low) & (points[:, :2] < self.high)).all(1)
+        grid[tuple(self._cells(points[near]).T)] = True
+        return grid
+
+    def rectangle(self, box: np.ndarray, margin: int = 0) -> tuple[slice, ...]:
+        """Return the cells below a box (2, 3), with a margin around them."""
+        first, last = self._cells(box)
+        return tuple(slice(max(a - margin, 0), b + margin + 1) for a, b in zip(first, last, strict=True))
+
+    def room_to_move(
+        self, blocked: np.ndarray, box: np.ndarray, most: float, axes: tuple[int, ...] = (0, 1)
+    ) -> np.ndarray:
+        """Return the translations (2, 3), each at most `most` long, that keep a box (2, 3) out of all blocked cells."""
+        blocked, corners = np.pad(blocked, 1, constant_values=True), self._cells(box) + 1
+        steps = np.zeros((2, 2), int)
+        growing = [(side, k) for k in axes for side in (0, 1)]
+        while growing:
+            for side, k in list(growing):
+                trial = steps.copy()
+                trial[side, k] += 1 if side else -1
+                (r0, c0), (r1, c1) = corners + trial
+                if abs(trial[side, k]) > int(most / self.cell) or blocked[r0 : r1 + 1, c0 : c1 + 1].any():
+                    growing.remove((side, k))
+                else:
+                    steps = trial
+        return np.column_stack([steps * self.cell, np.zeros(2)])
 
 
 def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
@@ -249,126 +351,34 @@ def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _translations(
-    scene: Any, points: Mapping[str, np.ndarray], names: list[str], room: np.ndarray, axis: int
-) -> np.ndarray | None:
-    """Return the translations (2, 3) by which a group can slide over its support, or along its wall or ceiling.
-
-    The group collides with nothing there. None if nothing carries it.
-    """
-    height = room[1, axis] - room[0, axis]
-    cell, reach = height / 100, _REACH * height
-    b, c = (k for k in range(3) if k != axis)
-    own = np.concatenate([points[n] for n in names])
-    box = _box(own)
-    low, high = box[0] - reach, box[1] + reach
-    shape = tuple(int(np.ceil((high[k] - low[k]) / cell)) for k in (b, c))
-    at = lambda p: tuple(
-        np.floor((p[:, k] - low[k]) / cell).astype(int).clip(0, n - 1) for k, n in zip((b, c), shape, strict=True)
-    )
-    blocked = np.zeros(shape, bool)
-    for name, cloud in points.items():
-        if name not in names:
-            near = (cloud[:, [b, c]] > low[[b, c]]).all(1) & (cloud[:, [b, c]] < high[[b, c]]).all(1)
-            near &= (cloud[:, axis] > box[0, axis] + 2 * cell) & (cloud[:, axis] < box[1, axis] - cell)
-            blocked[at(cloud[near])] = True
-    centres = np.zeros((shape[0] * shape[1], 3))
-    rows, columns = np.indices(shape).reshape(2, -1)
-    centres[:, b], centres[:, c] = low[b] + (rows + 0.5) * cell, low[c] + (columns + 0.5) * cell
-    outside = ~((centres >= room[0]) & (centres <= room[1]))[:, [b, c]].all(1).reshape(shape)
-    centres[:, axis] = box[0, axis] + cell
-    t = trace(scene, centres, np.tile(-np.eye(3)[axis], (len(centres), 1)))
-    carried = (t < 3 * cell).reshape(shape)
-    first, last = (np.array(at(box[[k]])).ravel() for k in (0, 1))
-    foot = _box(own[own[:, axis] < box[0, axis] + 2 * cell])
-    (r0, c0), (r1, c1) = (np.array(at(foot[[k]])).ravel() for k in (0, 1))
-    under, ring = np.zeros(shape, bool), np.zeros(shape, bool)
-    under[r0 : r1 + 1, c0 : c1 + 1] = True
-    ring[max(r0 - 2, 0) : r1 + 3, max(c0 - 2, 0) : c1 + 3] = True
-    ring &= ~under & ~outside  # only around its feet: under them, rays would hit the group itself
-    result = np.zeros((2, 3))
-    blocked[first[0] : last[0] + 1, first[1] : last[1] + 1] = False
-    if ring.any() and carried[ring].mean() > 0.5:
-        steps = _grow(blocked | outside | (~carried & ~under), first, last, int(reach / cell))
-        result[:, b], result[:, c] = steps[:, 0] * cell, steps[:, 1] * cell
-        return result
-    if box[1, axis] > room[1, axis] - 3 * cell and box[1, axis] - box[0, axis] < 0.5 * height:  # a lamp on the ceiling
-        steps = _grow(blocked | outside, first, last, int(reach / 3 / cell))
-        result[:, b], result[:, c] = steps[:, 0] * cell, steps[:, 1] * cell
-        return result
-    thin = min((b, c), key=lambda k: box[1, k] - box[0, k])
-    along = c if thin == b else b
-    gaps = np.abs(box[:, thin] - room[:, thin])
-    if box[1, thin] - box[0, thin] > 0.1 * height or gaps.min() > 0.06 * height:
-        return None
-    # It hangs on a wall: points level with its front, or slightly before it, block it.
-    side = int(gaps.argmin() == 0)
-    sign = 1 if side else -1
-    stop = np.zeros((shape[(b, c).index(along)], 1), bool)
-    for name, cloud in points.items():
-        depth = sign * (cloud[:, thin] - box[side, thin])
-        hit = (
-            (depth > -cell / 2) & (depth < 3 * cell) & (cloud[:, axis] > box[0, axis]) & (cloud[:, axis] < box[1, axis])
-        )
-        if name not in names:
-            stop[np.floor((cloud[hit, along] - low[along]) / cell).astype(int).clip(0, len(stop) - 1)] = True
-    k = (b, c).index(along)
-    places = low[along] + (np.arange(len(stop)) + 0.5) * cell
-    stop[:, 0] |= (places < room[0, along]) | (places > room[1, along])
-    stop[first[k] : last[k] + 1] = False
-    steps = _grow(stop, np.array([first[k], 0]), np.array([last[k], 0]), int(reach / 3 / cell))
-    result[:, along] = steps[:, 0] * cell
-    return result
-
-
-def _grow(blocked: np.ndarray, first: np.ndarray, last: np.ndarray, most: int) -> np.ndarray:
-    """Return by how many cells (2, 2) a rectangle can grow to each side without reaching a blocked cell."""
-    steps = np.zeros((2, 2), int)
-    growing = [(side, k) for k in (0, 1) for side in (0, 1)]
-    while growing:
-        for side, k in list(growing):
-            trial = steps.copy()
-            trial[side, k] += 1 if side else -1
-            (r0, c0), (r1, c1) = first + trial[0], last + trial[1]
-            inside = r0 >= 0 and c0 >= 0 and r1 < blocked.shape[0] and c1 < blocked.shape[1]
-            if abs(trial[side, k]) > most or not inside or blocked[r0 : r1 + 1, c0 : c1 + 1].any():
-                growing.remove((side, k))
-            else:
-                steps = trial
-    return steps
-
-
-def _camera(scene: Any, room: np.ndarray, axis: int) -> tuple[np.ndarray, str]:
+def _camera(rays: _Rays, room: np.ndarray) -> tuple[np.ndarray, str]:
     """Find a large box at eye height in which most points are free: nothing within a tenth of the room's height."""
-    height = room[1, axis] - room[0, axis]
-    box = room + 0.1 * height * np.array([[1], [-1]])
-    box[:, axis] = room[0, axis] + height * np.array([0.3, 0.75])
-    counts = [12, 12, 12]
-    counts[axis] = 4
-    cells = _grid(box, (counts[0], counts[1], counts[2]))
-    directions = np.random.default_rng(0).normal(size=(26, 3))
+    height = room[1, 2] - room[0, 2]
+    box = room - 0.1 * height * _OUTWARD
+    box[:, 2] = room[0, 2] + height * np.array([0.3, 0.75])
+    layers = (12, 12, 4)
+    cells = _grid(box, layers)
+    directions = np.random.default_rng(0).normal(size=(26, 3))[:, rays.order]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    t = trace(scene, np.repeat(cells, len(directions), 0), np.tile(directions, (len(cells), 1)))
-    free = (t.reshape(len(cells), -1) > 0.1 * height).all(1).reshape(counts)
-    low, high = [0, 0, 0], list(counts)
+    t = rays(np.repeat(cells, len(directions), 0), np.tile(directions, (len(cells), 1)))
+    free = (t.reshape(len(cells), -1) > 0.1 * height).all(1).reshape(layers)
+    low, high = np.zeros(3, int), np.array(layers)
     while True:
-        part = free[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+        part = free[tuple(map(slice, low, high))]
         if part.mean() >= 0.9 or max(part.shape) == 1:
             break
         # Drop the outermost layer with the least free space; if layers tie, the one of the longer axis.
-        layers = [(part.take(-side, k).mean(), -part.shape[k], k, side) for k in range(3) for side in (0, 1)]
-        _, _, k, side = min(layer for layer in layers if part.shape[layer[2]] > 1)
+        outermost = [(part.take(-side, k).mean(), -part.shape[k], k, side) for k in range(3) for side in (0, 1)]
+        _, _, k, side = min(layer for layer in outermost if part.shape[layer[2]] > 1)
         low[k] += side == 0
         high[k] -= side == 1
-    size = np.ptp(box, axis=0) / counts
+    size = np.ptp(box, axis=0) / layers
     return np.stack([box[0] + low * size, box[0] + high * size]), f"{part.mean():.0%} of its points are free"
 
 
-def _light(room: np.ndarray, axis: int) -> MovingLight:
+def _light(room: np.ndarray) -> MovingLight:
     """Place a light under the middle of the ceiling, with a quarter of its width and length."""
-    level = [k for k in range(3) if k != axis]
     size = np.ptp(room, axis=0)
-    box = np.stack([room.mean(0), room.mean(0)])
-    box[:, level] += np.outer([-0.25, 0.25], size[level])
-    box[:, axis] = room[1, axis] - 0.04 * size[axis]
-    return MovingLight(0.25 * size[level], np.array([15.0, 13.6, 11.6]), box)
+    box = np.stack([room.mean(0), room.mean(0)]) + 0.25 * size * _OUTWARD
+    box[:, 2] = room[1, 2] - 0.04 * size[2]
+    return MovingLight(0.25 * size[:2], np.array([15.0, 13.6, 11.6]), box)
