@@ -163,10 +163,10 @@ def _flatten_shapes(document: Document, root: ET.Element) -> None:
     def add(shape: ET.Element, prefix: str, outer: list[ET.Element]) -> None:
         kind, name = shape.get("type", ""), shape.get("id", "")
         if kind in ("shapegroup", "merge", "instance"):
-            parts = shape
+            parts: ET.Element | None = shape
             if kind == "instance":
                 reference = shape.find("ref")
-                parts = groups.get(reference.get("id")) if reference is not None else shape.find("shape")  # type: ignore[assignment]
+                parts = shape.find("shape") if reference is None else groups.get(reference.get("id"))
                 outer = [*(shape.find("transform") or ()), *outer]
             for part in parts.findall("shape") if parts is not None else ():
                 add(copy.deepcopy(part), f"{prefix}{name}_" if name and kind == "instance" else prefix, outer)

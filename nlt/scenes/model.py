@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import math
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -77,7 +79,7 @@ def named_files(path: Path) -> list[str]:
         files = [path.parent / name for name in names]
         inner = [words for f in files if f.is_file() for words in _lines(f) if words[0].lower() in _MAPS]
         return [*names, *sorted({words[-1].replace("\\", "/") for words in inner})]
-    header, _ = _read_gltf(path)
+    header = _gltf_header(path)
     uris = [part.get("uri", "") for key in ("buffers", "images") for part in header.get(key, [])]
     return [unquote(uri) for uri in uris if uri and not uri.startswith("data:")]
 
@@ -88,73 +90,104 @@ def read_gltf(path: Path) -> Model:
     Raises:
         UserError: the file is not valid glTF 2.0.
     """
-    header, rest = _read_gltf(path)
+    header = _gltf_header(path)
     model, materials = Model(), header.get("materials", [])
     for k, material in enumerate(materials):
         material["name"] = str(k)  # identifies the material of a loaded part
     for part in (*header.get("buffers", []), *header.get("images", [])):
         if not part.get("uri", "data:").startswith("data:"):
             part["uri"] = unquote(part["uri"])  # trimesh opens the file of this name
+    lamps = _gltf_lamps(header, model)
     try:
         loaded = trimesh.load_scene(
-            io.BytesIO(_pack(header, rest)),
-            file_type="gltf" if rest is None else "glb",
+            io.BytesIO(json.dumps(header).encode()),
+            file_type="gltf",
             resolver=trimesh.resolvers.FilePathResolver(str(path)),
             process=False,
         )
     except Exception as error:  # a broken file can make trimesh raise any exception
         raise UserError(f"{path}: not readable as glTF 2.0: {type(error).__name__}: {error}") from None
     converted = [_gltf_material(m, model) for m in materials]
-    for node in sorted(loaded.graph.nodes_geometry):
-        matrix, name = loaded.graph[node]
-        mesh = loaded.geometry[name]
+    placed = [(_part_name(loaded.graph, node), *loaded.graph[node]) for node in loaded.graph.nodes_geometry]
+    for name, matrix, geometry in sorted(placed, key=lambda part: (part[0], part[2])):
+        mesh = loaded.geometry[geometry]
         if not isinstance(mesh, trimesh.Trimesh):
-            model.warnings[f"{node} consists of points or lines and is ignored"] += 1
+            model.warnings[f"{name} consists of points or lines and is ignored"] += 1
             continue
-        material, uv, source = Material((1.0, 1.0, 1.0)), None, None
-        if isinstance(mesh.visual, trimesh.visual.TextureVisuals):
-            if mesh.visual.uv is not None:
-                uv = np.asarray(mesh.visual.uv, float) * [1, -1] + [0, 1]
-            if (mesh.visual.material.name or "").isdigit():
-                source = int(mesh.visual.material.name)
-                material = converted[source]
-                _images(material, mesh.visual.material)
-                if "baseColorTexture" in materials[source].get("pbrMetallicRoughness", {}) and material.image is None:
-                    model.warnings["an unreadable image is ignored"] += 1
-        elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.kind == "vertex":
-            model.warnings["vertex colours are replaced by their mean"] += 1
-            material.colour = tuple(linear(np.asarray(mesh.visual.vertex_colors)[:, :3].mean(0) / 255))
-        if uv is not None and source is not None:
-            uv = _texture_transform(materials[source], uv)
+        material, uv = _gltf_surface(mesh.visual, materials, converted, model)
         normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache.cache else None
         triangles = Triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), normals, uv)
-        model.parts.append((node, triangles.moved(matrix), material))
-    _lamps(header, model)
+        model.parts.append((name, triangles.moved(matrix), material))
+    for node, (name, intensity) in lamps.items():
+        if node in loaded.graph.nodes:
+            model.lamps.append((name, loaded.graph[node][0][:3, 3], intensity))
     return model
 
 
-def _read_gltf(path: Path) -> tuple[dict[str, Any], bytes | None]:
-    """Return the JSON header and, for a GLB file, the bytes after it."""
-    data, rest = path.read_bytes(), None
+def _gltf_header(path: Path) -> dict[str, Any]:
+    """Return the JSON header; the binary part of a GLB file becomes a data URI in it."""
+    data, binary = path.read_bytes(), b""
     if path.suffix.lower() == ".glb":
         if data[:4] != b"glTF" or len(data) < 20:
             raise UserError(f"{path}: not a GLB file: it does not start with glTF")
         (length,) = struct.unpack("<I", data[12:16])
-        data, rest = data[20 : 20 + length], data[20 + length :]
+        data, binary = data[20 : 20 + length], data[28 + length :]
     try:
         header = json.loads(data)
         assert isinstance(header, dict) and header["asset"]["version"].startswith("2")
     except (ValueError, AssertionError, LookupError, TypeError, AttributeError):
         raise UserError(f"{path}: not a glTF 2.0 file") from None
-    return header, rest
+    if binary and header.get("buffers"):
+        header["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{base64.b64encode(binary).decode()}"
+    return header
 
 
-def _pack(header: dict[str, Any], rest: bytes | None) -> bytes:
-    text = json.dumps(header).encode()
-    if rest is None:
-        return text
-    text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+def _gltf_lamps(header: dict[str, Any], model: Model) -> dict[str, tuple[str, np.ndarray]]:
+    """Give every light of KHR_lights_punctual a node of its own; return name and intensity (3,) by node."""
+    lights = header.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
+    nodes, lamps = header.get("nodes", []), {}
+    for k, node in enumerate(list(nodes)):
+        index = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
+        if index is None or index >= len(lights):
+            continue
+        light = lights[index]
+        if light.get("type") == "directional":
+            model.warnings["a directional light is ignored: nlt has only area lights and environments"] += 1
+            continue
+        if light.get("type") == "spot":
+            model.warnings["a spot light is treated as a point light"] += 1
+        own = f"KHR_lights_punctual {k}"
+        node["children"] = [*node.get("children", []), len(nodes)]
+        nodes.append({"name": own})
+        intensity = light.get("intensity", 1.0) * np.array(light.get("color", [1.0, 1.0, 1.0]))
+        lamps[own] = node.get("name", light.get("name", f"light_{k}")), intensity
+    return lamps
+
+
+def _part_name(graph: Any, node: str) -> str:
+    """Return a node's name, without the random suffix that trimesh gives to parts of meshes of several materials."""
+    parent = graph.transforms.parents.get(node, "")
+    return parent if re.fullmatch(re.escape(parent) + r"_\w{6}", node) else node
+
+
+def _gltf_surface(
+    visual: Any, materials: list[dict[str, Any]], converted: list[Material], model: Model
+) -> tuple[Material, np.ndarray | None]:
+    """Return the material and the texture coordinates (V, 2) or None of a loaded part."""
+    if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+        model.warnings["vertex colours are replaced by their mean"] += 1
+        return Material(tuple(linear(np.asarray(visual.vertex_colors)[:, :3].mean(0) / 255))), None
+    if not isinstance(visual, trimesh.visual.TextureVisuals):
+        return Material((1.0, 1.0, 1.0)), None
+    uv = None if visual.uv is None else np.asarray(visual.uv, float) * [1, -1] + [0, 1]
+    if not (visual.material.name or "").isdigit():
+        return Material((1.0, 1.0, 1.0)), uv
+    source = int(visual.material.name)
+    material = converted[source]
+    _images(material, visual.material)
+    if "baseColorTexture" in materials[source].get("pbrMetallicRoughness", {}) and material.image is None:
+        model.warnings["an unreadable image is ignored"] += 1
+    return material, None if uv is None else _texture_transform(materials[source], uv)
 
 
 def _gltf_material(data: dict[str, Any], model: Model) -> Material:
@@ -198,43 +231,6 @@ def _texture_transform(material: dict[str, Any], uv: np.ndarray) -> np.ndarray:
     angle = transform.get("rotation", 0.0)
     rotation_matrix = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
     return uv * transform.get("scale", [1, 1]) @ rotation_matrix.T + transform.get("offset", [0, 0])
-
-
-def _lamps(header: dict[str, Any], model: Model) -> None:
-    """Add the lights of KHR_lights_punctual, in the units of the emissive factors."""
-    lights = header.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
-    for k, (node, matrix) in enumerate(_nodes(header)):
-        index = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
-        if index is None or index >= len(lights):
-            continue
-        light = lights[index]
-        kind, name = light.get("type"), node.get("name", light.get("name", f"light_{k}"))
-        if kind == "directional":
-            model.warnings["a directional light is ignored: nlt has only area lights and environments"] += 1
-            continue
-        if kind == "spot":
-            model.warnings["a spot light is treated as a point light"] += 1
-        intensity = light.get("intensity", 1.0) * np.array(light.get("color", [1.0, 1.0, 1.0]))
-        model.lamps.append((name, matrix[:3, 3], intensity))
-
-
-def _nodes(header: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield every node of the default scene with its node-to-world matrix (4, 4)."""
-    nodes = header.get("nodes", [])
-    scenes = header.get("scenes") or [{"nodes": list(range(len(nodes)))}]
-    waiting = [(k, np.eye(4)) for k in scenes[header.get("scene", 0)].get("nodes", [])]
-    while waiting:
-        k, parent = waiting.pop(0)
-        node = nodes[k]
-        if "matrix" in node:
-            local = np.array(node["matrix"], float).reshape(4, 4).T
-        else:
-            x, y, z, w = node.get("rotation", [0, 0, 0, 1])
-            local = trimesh.transformations.quaternion_matrix([w, x, y, z])
-            local[:3, :3] *= node.get("scale", [1, 1, 1])
-            local[:3, 3] = node.get("translation", [0, 0, 0])
-        yield node, parent @ local
-        waiting += [(child, parent @ local) for child in node.get("children", [])]
 
 
 # OBJ files are parsed here because trimesh joins all parts of one material and loses the texture coordinates of quads.

@@ -596,6 +596,20 @@ def test_glb_of_trimesh(tmp_path):
     np.testing.assert_allclose(under_white_sky(importer.load(tmp_path / "chair.glb")), [1, 0, 0], atol=0.01)
 
 
+def test_parts_of_a_mesh_have_the_same_names_every_time(tmp_path):
+    """trimesh gives the parts of a mesh of several materials random names."""
+    path = write_gltf(tmp_path / "quads.gltf", [{"emissiveFactor": [1, 0, 0]}, {"emissiveFactor": [0, 1, 0]}])
+    content = json.loads(path.read_text())
+    content["meshes"][0]["primitives"] += content["meshes"].pop()["primitives"]
+    content["nodes"], content["scenes"] = content["nodes"][:1], [{"nodes": [0]}]
+    path.write_text(json.dumps(content))
+    for _ in range(3):
+        shapes = importer.load(path).shapes()
+        assert [s.id() for s in shapes] == ["quad_0", "quad_0_2"]
+        radiances = [np.array(mi.traverse(s.emitter())["radiance.value"]).ravel() for s in shapes]
+        np.testing.assert_allclose(radiances, [[1, 0, 0], [0, 1, 0]])
+
+
 OBJ = """mtllib my room.mtl
 o Table
 v -0.5 -0.5 0
