@@ -45,7 +45,7 @@ def _read(file: Path, above: Sequence[Path] = ()) -> dict[str, Any]:
         raise UserError(f"{file}: No such file{_known_files(file)}") from None
     except OSError as error:
         raise UserError(f"{file}: cannot be read: {error.strerror}") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"{file}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, Mapping):
         raise UserError(f"{file}: must be a mapping, is a {type(content).__name__}")

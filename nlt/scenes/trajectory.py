@@ -77,10 +77,8 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
         targets = turn(description.look_at, up, frames, phase=0.5)
     else:
         read = parse(_CameraPath, read_configs([path]), path)
-        positions, targets = (
-            follow(np.array([getattr(view, end) for view in read.views]), frames, read.closed)
-            for end in ("position", "target")
-        )
+        keys = np.array([(view.position, view.target) for view in read.views])
+        positions, targets = (follow(keys[:, end], frames, read.closed) for end in (0, 1))
         fov = read.fov or fov
     for k, (position, target) in enumerate(zip(positions, targets, strict=True)):
         direction = target - position
