@@ -25,6 +25,7 @@ _FRAMES = ("bench", "compare", "render")
 # Help texts of several commands.
 _IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
+_SCENE = "description in configs/scenes or in your ./scenes, by name or path"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -174,7 +175,9 @@ def _scenes(options: argparse.Namespace) -> None:
     elif options.action == "check":
         print(describe.check(options.file))
     else:
-        print(describe.add(options.file, options.name, options.output))
+        file = describe.add(options.file, options.name, options.output)
+        scene = options.output or options.name or file.stem
+        print(f"written to {file}: check and edit it, then look at it: nlt scenes preview {scene} -o {file.stem}.png")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -282,7 +285,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="checkpoint, or NAME.safetensors from nlt export")
-    parser.add_argument("scene", nargs="?", metavar="SCENE", help="description in configs/scenes, by name or path")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help=_SCENE)
     parser.add_argument("--demo", action="store_true", help="use the model that comes with nlt and move the light")
     parser.add_argument("--state", default="0", help="index of a random state, or a YAML file (default: 0)")
     parser.add_argument("--light", choices=("turntable",), help="move the light around (default: as in --state)")
@@ -301,18 +304,18 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
-    actions.add_parser("list", help="list the scene descriptions in configs/scenes")
+    actions.add_parser("list", help="list the scene descriptions in configs/scenes and in your ./scenes")
     show = actions.add_parser("show", help="show the content of a scene description and its scene")
-    show.add_argument("name", help="scene description in configs/scenes, by name or path")
+    show.add_argument("name", help=_SCENE)
     check = actions.add_parser("check", help="load a scene file and report its content, problems and description")
     add = actions.add_parser("add", help="measure a scene file and write a scene description that you can edit")
     for action in (check, add):
         action.add_argument("file", type=Path, help="Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ")
     add.add_argument("--name", help="name of the scene (default: the file's name, or its folder's for scene.xml)")
-    add.add_argument("-o", "--output", type=Path, help="file to write (default: configs/scenes/NAME.yaml)")
+    add.add_argument("-o", "--output", type=Path, help="file to write (default: scenes/NAME.yaml)")
     preview = actions.add_parser("preview", help="draw a contact sheet with one row of random views per scene")
     preview.add_argument("-o", "--output", type=_picture, default="preview.png", help=_IMAGE.format("preview.png"))
-    preview.add_argument("names", nargs="+", help="scene descriptions in configs/scenes, by name or path")
+    preview.add_argument("names", nargs="+", help=f"scenes: each a {_SCENE}")
     preview.add_argument("--views", type=_positive, default=4, help="random views per scene (default: 4)")
     preview.add_argument(
         "--resolution", type=_positive, default=256, help="image height and width in pixels (default: 256)"

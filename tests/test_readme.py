@@ -9,6 +9,7 @@ import subprocess
 import tomllib
 import types
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from nlt.evaluation.comparison import Comparison, build_if_untrained
 from nlt.metrics import quantities
 from nlt.paths import PROJECT, find_config
 from nlt.rendering.renderer import Renderer
-from nlt.scenes import builtin, describe
+from nlt.scenes import builtin
 from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import rooms
 from nlt.scenes.description import load_description
@@ -95,7 +96,6 @@ def sandbox(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(paths, "CONFIGS", folder / "configs")
-        patch.setattr(describe, "CONFIGS", folder / "configs")
         patch.setattr(nlt.baselines, "__path__", [*nlt.baselines.__path__, str(folder / "nlt/baselines")])
         yield folder
 
@@ -174,7 +174,7 @@ def test_recipes(sandbox, monkeypatch, capsys):
     monkeypatch.setattr(generation, "_announce", lambda *_: None)  # what it will take, which it tries out
     for command, smaller in RUN.items():
         assert main(shlex.split(f"{command} {smaller}")[1:]) == 0, command
-    assert load_description("room").file == sandbox / "configs/scenes/room.yaml"
+    assert load_description("room").file == Path("scenes/room.yaml")
     assert (sandbox / "room.png").stat().st_size > 0
     (dataset,) = (sandbox / "datasets").glob("fixed_lights-room-16-*")
     assert len(list(dataset.rglob("*.safetensors"))) == 4

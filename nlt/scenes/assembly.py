@@ -6,7 +6,7 @@ transforms of their instances. Emitting shapes cannot be instanced and stay plai
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -73,10 +73,12 @@ class Scene:
             )
         self.shapes = {name: read_shape(mesh, description.units_per_metre, own_lights) for name, mesh in meshes.items()}
         if not own_lights:
-            meshes = {n: _without_emitter(m, self.shapes[n]) if m.is_emitter() else m for n, m in meshes.items()}
+            # An emitter of zero radiance would still be sampled and add noise.
+            dark = lambda name, mesh: live_mesh(name, read_triangles(mesh), self.shapes[name].bsdf)
+            meshes = {name: dark(name, mesh) if mesh.is_emitter() else mesh for name, mesh in meshes.items()}
         self._assemble(meshes)
         self.masks = any(is_mask(shape.bsdf) for shape in self.shapes.values())
-        self._centres = {movable.name: self._centre(movable) for movable in self.movables}
+        self._centres = {m.name: self._centre(m) for m in self.movables}
         self.set_state(rest_state(description, experiment))
 
     def _check_shapes(self, known: set[str]) -> None:
@@ -85,7 +87,7 @@ class Scene:
             for shape in movable.shapes:
                 where = f"{self.description.file}: objects.{movable.name}.shapes"
                 if shape not in known:
-                    raise UserError(f"{where}: the scene has no shape {shape!r}; its shapes are {_some(known)}")
+                    raise UserError(f"{where}: the scene has no shape {shape!r}; its shapes are {some(sorted(known))}")
                 if shape in claimed:
                     raise UserError(f"{where}: shape {shape!r} already belongs to {claimed[shape]}")
                 claimed[shape] = movable.name
@@ -214,9 +216,9 @@ def light_quad(description: SceneDescription) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _some(names: set[str]) -> str:
-    listed = sorted(names)
-    return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
+def some(names: Sequence[str]) -> str:
+    """Return the first names and the number of the others."""
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def _facing_down(up: np.ndarray) -> np.ndarray:
@@ -240,16 +242,10 @@ def load_source(description: SceneDescription) -> Any:
 
 def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True) -> Shape:
     """Convert a Mitsuba mesh to a shape in metres, without its emitter if the scene's own lights are off."""
-    parameters = mi.traverse(mesh)
-    uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2) if mesh.has_vertex_texcoords() else None
-    return Shape(
-        mesh.id(),
-        np.array(parameters["vertex_positions"], float).reshape(-1, 3) / units_per_metre,
-        np.array(parameters["faces"]).reshape(-1, 3).astype(np.int64),
-        uv,
-        mesh.bsdf(),
-        mesh.emitter() if own_lights and mesh.is_emitter() else None,
-    )
+    triangles, emitter = read_triangles(mesh), mesh.emitter() if own_lights and mesh.is_emitter() else None
+    uv = None if triangles.uv is None else triangles.uv.astype(float)
+    vertices, faces = triangles.vertices.astype(float) / units_per_metre, triangles.faces.astype(np.int64)
+    return Shape(mesh.id(), vertices, faces, uv, mesh.bsdf(), emitter)
 
 
 def read_triangles(mesh: Any) -> Triangles:
@@ -259,8 +255,3 @@ def read_triangles(mesh: Any) -> Triangles:
     normals = column("vertex_normals", 3) if mesh.has_vertex_normals() else None
     uv = column("vertex_texcoords", 2) if mesh.has_vertex_texcoords() else None
     return Triangles(column("vertex_positions", 3), column("faces", 3), normals, uv)
-
-
-def _without_emitter(mesh: Any, shape: Shape) -> Any:
-    """Return the mesh without its emitter. An emitter of zero radiance would still be sampled and add noise."""
-    return live_mesh(shape.id, read_triangles(mesh), shape.bsdf)

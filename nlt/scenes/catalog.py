@@ -1,4 +1,4 @@
-"""`nlt scenes list`: all descriptions in configs/scenes, read without a renderer."""
+"""`nlt scenes list`: all descriptions in configs/scenes and in the user's ./scenes, read without a renderer."""
 
 from __future__ import annotations
 

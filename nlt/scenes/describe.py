@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 import yaml
 
 from nlt.errors import UserError
-from nlt.paths import CONFIGS, scenes_root
-from nlt.scenes.assembly import Shape, load_source, read_shape
-from nlt.scenes.description import MATERIALS, load_description
+from nlt.paths import OWN_SCENES, find_config, scenes_root
+from nlt.scenes.assembly import Shape, load_source, read_shape, some
+from nlt.scenes.description import MATERIALS, Movable, load_description
 from nlt.scenes.importer import Imported, read
 from nlt.scenes.pointcloud import material
 from nlt.scenes.proposal import Proposal, propose
@@ -38,7 +38,7 @@ def show(name: str) -> str:
     if description.light is not None:
         size, box = description.light.size, description.light.box
         lines.append(f"moving light: {size[0]:.3g} x {size[1]:.3g} m in {_span(box)} m")
-    lines += _objects((o.name, o.shapes, o.box) for o in description.objects)
+    lines += _objects(description.objects)
     return "\n".join([*lines, *_contents(shapes, source.environment() is not None)])
 
 
@@ -53,7 +53,7 @@ def check(path: Path) -> str:
     because = proposal.because
     lines = [
         str(path),
-        *_contents(shapes.values(), environment),
+        *_contents(list(shapes.values()), environment),
         f"bounding box: {_span(proposal.bounds)}",
         f"up: +{proposal.up} ({because['up']})",
         f"units per metre: {proposal.units_per_metre:g} ({because['units_per_metre']})",
@@ -61,7 +61,7 @@ def check(path: Path) -> str:
         f"camera: {_span(proposal.camera)} ({because['camera']})",
         f"ceiling: {proposal.room[1, 'xyz'.index(proposal.up)]:.4g}; moving light: "
         f"{proposal.light.size[0]:.3g} x {proposal.light.size[1]:.3g} in {_span(proposal.light.box)}",
-        *_objects((o.name, o.shapes, o.box) for o in proposal.objects),
+        *_objects(proposal.objects),
     ]
     if imported.camera is not None:
         eye, forward = imported.camera[:3, 3], imported.camera[:3, 2]
@@ -76,9 +76,10 @@ def add(path: Path, name: str | None = None, output: Path | None = None) -> Path
         UserError: the file cannot be loaded, or the description already exists.
     """
     name = name or re.sub(r"[^\w-]+", "_", path.resolve().parent.name if path.stem == "scene" else path.stem)
-    file = output or CONFIGS / "scenes" / f"{name}.yaml"
-    if file.exists():
-        raise UserError(f"{file}: already exists; choose another with --name or -o, or delete it")
+    file = output or OWN_SCENES / f"{name}.yaml"
+    for taken in (file, find_config("scenes", name)) if output is None else (file,):
+        if taken.exists():
+            raise UserError(f"{taken}: already exists; choose another name with --name, or another file with -o")
     imported, _, proposal = _propose(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(_yaml(path, name, imported, proposal))
@@ -105,11 +106,10 @@ def _warnings(imported: Imported, proposal: Proposal) -> list[str]:
     return messages
 
 
-def _contents(shapes: Iterable[Shape], environment: bool) -> list[str]:
-    shapes = list(shapes)
+def _contents(shapes: Sequence[Shape], environment: bool) -> list[str]:
     kinds = Counter(material(shape.bsdf) for shape in shapes)
     emitting = [shape.id for shape in shapes if shape.emitter is not None]
-    lights = f"{len(emitting)} area emitters{': ' + _some(emitting) if emitting else ''}"
+    lights = f"{len(emitting)} area emitters{': ' + some(emitting) if emitting else ''}"
     return [
         f"shapes: {len(shapes)}, triangles: {sum(len(shape.faces) for shape in shapes):,}",
         f"light: {lights}{'; an environment' if environment else '; no environment'}",
@@ -117,14 +117,9 @@ def _contents(shapes: Iterable[Shape], environment: bool) -> list[str]:
     ]
 
 
-def _objects(objects: Iterable[tuple[str, tuple[str, ...], np.ndarray]]) -> list[str]:
-    listed = [f"  {name}: {_some(shapes)}; moves by {_span(box)}" for name, shapes, box in objects]
-    return [f"movable objects: {len(listed)}", *listed]
-
-
-def _some(names: Iterable[str]) -> str:
-    listed = list(names)
-    return ", ".join(listed[:6]) + (f" and {len(listed) - 6} more" if len(listed) > 6 else "")
+def _objects(objects: Sequence[Movable]) -> list[str]:
+    lines = [f"  {movable.name}: {some(movable.shapes)}; moves by {_span(movable.box)}" for movable in objects]
+    return [f"movable objects: {len(objects)}", *lines]
 
 
 def _span(box: np.ndarray) -> str:

@@ -65,16 +65,13 @@ def curved(kind: str) -> Triangles:
 def bsdf(material: Material) -> dict[str, Any]:
     """Return the nearest Mitsuba BSDF: diffuse, plastic, conductor or glass if one of these fits, else `principled`."""
     colour = _texture(material.colour, material.image)
-    alpha = max(material.roughness**2, 1e-3)
-    smooth = material.roughness < 0.05
+    prefix, alpha = "rough", {"alpha": max(material.roughness**2, 1e-3)}
+    if material.roughness < 0.05 or (material.transmission > 0.5 and material.thin):
+        prefix, alpha = "", {}
     inner: dict[str, Any]
     if material.transmission > 0.5:
-        tint = {"specular_transmittance": colour}
-        if material.thin:
-            return {"type": "thindielectric", "int_ior": material.ior, **tint}
-        if smooth:
-            return {"type": "dielectric", "int_ior": material.ior, **tint}
-        return {"type": "roughdielectric", "int_ior": material.ior, "alpha": alpha, **tint}
+        kind = "thindielectric" if material.thin else f"{prefix}dielectric"
+        return {"type": kind, "int_ior": material.ior, "specular_transmittance": colour, **alpha}
     if material.rough_image is not None or 0.01 < material.metallic < 0.99:
         inner = {
             "type": "principled",
@@ -83,21 +80,12 @@ def bsdf(material: Material) -> dict[str, Any]:
             "metallic": _channel(material.metallic, material.rough_image, 2),
         }
     elif material.metallic >= 0.99:
-        inner = {
-            "type": "conductor" if smooth else "roughconductor",
-            "material": "none",
-            "specular_reflectance": colour,
-        }
-        inner |= {} if smooth else {"alpha": alpha}
+        inner = {"type": f"{prefix}conductor", "material": "none", "specular_reflectance": colour, **alpha}
     elif material.roughness > 0.9:
         inner = {"type": "diffuse", "reflectance": colour}
     else:
-        inner = {
-            "type": "plastic" if smooth else "roughplastic",
-            "diffuse_reflectance": colour,
-            "int_ior": material.ior,
-        }
-        inner |= {"nonlinear": True, **({} if smooth else {"alpha": alpha})}
+        inner = {"type": f"{prefix}plastic", "diffuse_reflectance": colour, "int_ior": material.ior}
+        inner |= {"nonlinear": True, **alpha}
     inner = {"type": "twosided", "inner": inner}
     if material.alpha < 1 or material.alpha_image is not None:
         opacity = _channel(material.alpha, material.alpha_image, 0, material.cutoff)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -76,7 +77,7 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
         positions = turn(description.camera, up, frames)
         targets = turn(description.look_at, up, frames, phase=0.5)
     else:
-        read = parse(_CameraPath, read_configs([path]), path)
+        read = parse(_CameraPath, read_configs([Path(path).absolute()]), path)
         keys = np.array([(view.position, view.target) for view in read.views])
         positions, targets = (follow(keys[:, end], frames, read.closed) for end in (0, 1))
         fov = read.fov or fov
@@ -104,7 +105,7 @@ def states(
     if state.isdecimal():
         read = _State(seed=int(state))
     else:
-        read = parse(_State, {k: v for k, v in read_configs([state]).items() if v is not None}, state)
+        read = parse(_State, {k: v for k, v in read_configs([Path(state).absolute()]).items() if v is not None}, state)
     base = _first_state(description, experiment, read, state)
     if not light and read.light is None:
         return [base] * frames

@@ -257,7 +257,7 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     refused(["render", "--demo", models.splat, "living_room"], "CKPT and SCENE")
     refused([*plain, "-o", "video.avi"], "video.avi")
     refused([*plain, "--spp", "many"], "--spp")
-    refused([*plain, "--camera-path", "nowhere.yaml"], "nowhere.yaml", "cannot be read")
+    refused([*plain, "--camera-path", "nowhere.yaml"], "nowhere.yaml", "No such file")
     for content, words in (
         ({}, ["views", "missing"]),
         ({"views": [view, {"position": [0, 0, 0]}]}, ["views.1.target", "missing"]),

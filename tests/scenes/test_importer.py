@@ -459,6 +459,21 @@ def test_check_and_add(tmp_path, capsys):
     assert f"{file}: already exists" in capsys.readouterr().err
 
 
+def test_own_scenes(tmp_path, monkeypatch, capsys):
+    """`add` writes into ./scenes, where the scene is found by its name; a built-in scene's name is taken."""
+    path, _ = furnished(tmp_path, 1)
+    monkeypatch.chdir(tmp_path)
+    assert main(["scenes", "add", str(path), "--name", "mine"]) == 0
+    said = capsys.readouterr().out
+    assert "scenes/mine.yaml" in said and "nlt scenes preview mine -o mine.png" in said
+    assert load_description("mine").file.resolve() == tmp_path / "scenes" / "mine.yaml"
+    assert main(["scenes", "list"]) == 0
+    assert "\nmine " in capsys.readouterr().out
+    for name in ("mine", "kitchen"):
+        assert main(["scenes", "add", str(path), "--name", name]) == 2
+        assert f"{name}.yaml: already exists" in capsys.readouterr().err
+
+
 def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):
     for name in ("good", "far"):
         write_yaml(tmp_path / f"{name}.yaml", **({"source": "far/scene.xml"} if name == "far" else {}))
