@@ -15,7 +15,7 @@ import lightning as L
 import yaml
 from jsonargparse import ArgumentError
 from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from PIL import Image
 
@@ -23,6 +23,7 @@ from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.display import display
 from nlt.errors import UserError
+from nlt.models.clouds import CloudMethod
 from nlt.models.factory import method_class, read_checkpoint, without_unused
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
@@ -90,9 +91,13 @@ class Predictions(BasePredictionWriter):
 class NLTCLI(LightningCLI):
     """LightningCLI in subclass mode, for one DataModule and any method."""
 
-    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        for name in ("num_scenes", "num_points"):
-            parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
+    def before_instantiate_classes(self) -> None:
+        """Tell a method with points their number; a linked argument would reach methods without points, too."""
+        config = self.config[self.config.subcommand]
+        if issubclass(method_class(config.as_dict(), "--config"), CloudMethod):
+            dataset = config.data.dataset
+            config.model.init_args.num_scenes = len(dataset.scenes)
+            config.model.init_args.num_points = dataset.points
 
     def _parse_ckpt_path(self) -> None:
         """Check the checkpoint; Lightning's version would silently replace the config's model by the checkpoint's."""
@@ -130,6 +135,8 @@ class _ConfigChecker(NLTCLI):
     def _set_seed(self) -> None: ...
 
     def _parse_ckpt_path(self) -> None: ...
+
+    def before_instantiate_classes(self) -> None: ...
 
     def instantiate_classes(self) -> None: ...
 
