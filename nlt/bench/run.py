@@ -252,7 +252,7 @@ class Benchmark:
         if type(method) is not wanted:
             raise UserError(f"--ckpt: {self.checkpoint}: is of {type(method).__name__}, not {wanted.__name__}")
         points = self.settings["points"]
-        points = min(points, method.hparams["max_points"] or points)
+        points = min(points, method.hparams.get("max_points") or points)
         for key, here in (("num_points", points), ("num_scenes", len(self.spec.scenes))):
             if key in method.architecture and method.hparams[key] != here:
                 raise UserError(
