@@ -13,7 +13,7 @@ from nlt.data.store import points_name
 from nlt.paths import PROJECT
 
 PAGES = [*sorted(PROJECT.glob("*.md")), *sorted((PROJECT / "docs").glob("*.md"))]
-STUDIES = ("results/table2_real/stress/stress.md", "results/sizes/leanest.md")
+STUDIES = ("results/leaner/leanest.md",)
 
 
 def anchors(page):
