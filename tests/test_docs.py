@@ -13,7 +13,7 @@ from nlt.data.store import points_name
 from nlt.paths import PROJECT
 
 PAGES = [*sorted(PROJECT.glob("*.md")), *sorted((PROJECT / "docs").glob("*.md"))]
-STUDIES = ("results/leaner/leanest.md",)
+STUDIES = ("results/sizes/leanest.md",)
 
 
 def anchors(page):
