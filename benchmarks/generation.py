@@ -16,9 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import shlex
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -132,7 +130,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=PROJECT / "results" / "bench")
     options = parser.parse_args()
-    manifest = origin() | {"command": shlex.join(["python", "benchmarks/generation.py", *sys.argv[1:]])}
+    manifest = origin()
     count = options.shard * (options.rounds + 1)
     spec = DatasetSpec(
         [options.scene],

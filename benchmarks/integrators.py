@@ -13,7 +13,6 @@ table.md, integrators.png and manifest.json.
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import time
 from pathlib import Path
@@ -57,7 +56,7 @@ def main() -> None:
     parser.add_argument("--experiment", choices=EXPERIMENTS, default="fixed_lights", help="default: fixed_lights")
     parser.add_argument("--seed", type=int, default=0, help="seed of states, views and noise (default: 0)")
     options = parser.parse_args()
-    begun = origin() | {"command": shlex.join(["python", *sys.argv])}
+    begun = origin()
     for name in options.names:
         load_description(name)  # reports mistakes before anything is rendered
     choose_variant()  # chosen once; the processes inherit it

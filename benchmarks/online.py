@@ -15,7 +15,6 @@ import copy
 import hashlib
 import json
 import logging
-import shlex
 import shutil
 import sys
 import time
@@ -205,7 +204,7 @@ def main() -> None:
     parser.add_argument("--out", default="results/online")
     options = parser.parse_args()
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    begun = origin() | {"command": shlex.join(["python", *sys.argv])}
+    begun = origin()
     files = [str(find_config(kind, getattr(options, name))) for kind, name in
              (("data", "data"), ("model", "method"), ("scale", "scale"))]  # fmt: skip
     spec, _ = load_spec([files[0], files[2]])

@@ -32,8 +32,9 @@ _CODE = ("nlt", "configs", "scripts", "benchmarks", "pyproject.toml")  # files t
 
 def origin() -> dict[str, Any]:
     """Return command, commit and time; call it at the start, because the checkout may change during the run."""
+    is_script = Path(sys.argv[0]).parent.name in ("benchmarks", "scripts")
     return {
-        "command": shlex.join(["nlt", *sys.argv[1:]]),
+        "command": shlex.join(["python", *sys.argv] if is_script else ["nlt", *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
         "uncommitted_changes": bool(_git("status", "--porcelain", "--", *_CODE)),  # including untracked files
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
