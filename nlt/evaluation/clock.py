@@ -6,6 +6,7 @@ import math
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -146,7 +147,8 @@ class Clock:
     def flops(self, method: RenderingModule) -> dict[str, int]:
         """Return the FLOPs of a batch's convolutions and matrix products by step, without sparse or int8 shortcuts."""
         batch, result, flops = self._inputs(method), None, {}
-        for name, step in method.to(self.device).eval().steps().items():
+        dense = accelerate(method, replace(self.policy, sparse=False, int8=False), self.device)
+        for name, step in dense.steps().items():
             with FlopCounterMode(display=False) as counter:
                 result = step(batch, result)
             flops[name] = counter.get_total_flops()
