@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, get_type_hints
@@ -192,16 +192,6 @@ class Shard:
     def name(self) -> str:
         """The file's name, relative to the dataset's directory."""
         return f"{self.split}/{self.scene:03d}-{self.start:07d}.safetensors"
-
-
-def check_keys(place: str, content: Mapping[str, Any], known: Collection[str], needed: Collection[str] = ()) -> None:
-    """Raise UserError if a config section has an unknown key or lacks a required one."""
-    for key in content:
-        if key not in known:
-            raise UserError(f"{place}{key}: unknown key; known are {', '.join(known)}")
-    for key in needed:
-        if key not in content:
-            raise UserError(f"{place}{key}: missing")
 
 
 class DataSection(Settings):
