@@ -58,7 +58,7 @@ def test_fewer_views_are_another_set(spec, tmp_path):
     ("near", "message"),
     [
         ({"values": []}, "camera.near.values: must be a list of at least 1, is []"),
-        ({"values": ["a"]}, "camera.near.values.0: must be a number, is 'a'"),
+        ({"values": ["a"]}, "camera.near.values.0: must be a number such as 0.5 or 1.0e-4, is 'a'"),
         ({"says": 3}, "camera.near.says: must be a text, is 3"),
         ({"colour": "red"}, "camera.near.colour: unknown key; known are change, values, says"),
     ],
