@@ -13,10 +13,8 @@ from scipy.ndimage import uniform_filter
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
-from nlt.report.figures import PICTURE, grid, save, shown
-from nlt.report.tables import Table, write_texts
-
-import matplotlib.pyplot as plt  # isort: skip  after figures.py has chosen the backend
+from nlt.report.plots import PICTURE, grid, plt, save, shown
+from nlt.report.table_writer import Table, write_texts
 
 FAILURES = "failures.csv"
 _VIEWS = 3  # in qualitative.webp
@@ -175,7 +173,7 @@ def draw_failures(images: Shown) -> None:
     write_rows(images.results.directory / FAILURES, rows)
     table = failures(images.results)
     assert table
-    write_texts(images.results, "failures", [table], f"images/*.npz, {FAILURES}")
+    write_texts(images.results.directory / "failures", [table], f"images/*.npz, {FAILURES}")
 
 
 def failures(results: Results) -> Table | None:

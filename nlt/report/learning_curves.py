@@ -10,7 +10,8 @@ import numpy as np
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import HISTORY, OK, TRAINING_IMAGES, Results
 from nlt.metrics.quantities import METRICS, heading
-from nlt.report.figures import COLOURS, DASHES, MARKERS, curves, plt, save
+from nlt.report.figures import curves
+from nlt.report.plots import COLOURS, DASHES, MARKERS, plt, save
 
 _PANELS = ("mse", "mssim", "fid", "feature_l1", "flip")
 _MAX_PANELS = 4  # per row

@@ -28,7 +28,8 @@ from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 from nlt.report.figures import bar, curves
 from nlt.report.gallery import FAILURES, Shown, failures
 from nlt.report.packing import max_error, pack_to_fit
-from nlt.report.tables import Table, tables
+from nlt.report.table_writer import Table
+from nlt.report.tables import tables
 
 PAGE = "report.html"
 _PARTS = Path(__file__).parent / "page_parts"

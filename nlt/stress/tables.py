@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import dataclass
@@ -15,13 +16,15 @@ import scipy.stats
 from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label, order
 from nlt.evaluation.results import MANIFEST, OK, read_rows, write_rows
-from nlt.report.tables import Table, as_markdown
+from nlt.report.table_writer import Table, section
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
 DOUBLED = 2.0  # growth over the clean error at which a method breaks
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
 _NONE = "–"
+Row = dict[str, Any]
+Ladder = tuple[str, str]  # suite and name
 
 
 @dataclass(frozen=True)
@@ -30,64 +33,61 @@ class Stressed:
 
     directory: Path
     manifest: dict[str, Any]
-    rows: list[dict[str, Any]]
-    trainings: list[dict[str, Any]]
+    rows: list[Row]
+    trainings: list[Row]
 
     @cached_property
     def methods(self) -> list[str]:
         return sorted({row["method"] for row in self.rows}, key=order)
 
-    @cached_property
-    def ladders(self) -> list[tuple[str, str]]:
-        """Suite and name of every ladder that has rows, in the manifest's order."""
-        present = {(row["suite"], row["ladder"]) for row in self.rows}
-        known = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
-        return [key for key in known if key in present]
+    @property
+    def suites(self) -> dict[str, Any]:
+        """The content of the suites' config."""
+        return self.manifest["manifest"]
 
-    def says(self, ladder: tuple[str, str]) -> str:
-        return str(self.manifest["manifest"][ladder[0]][ladder[1]]["says"])
+    def says(self, ladder: Ladder) -> str:
+        """Return what a ladder changes."""
+        return str(self.suites[ladder[0]][ladder[1]]["says"])
+
+    def title(self, ladder: Ladder) -> str:
+        return f"{ladder[0]}: {self.says(ladder)}"
 
     @cached_property
-    def _means(self) -> dict[tuple, float]:
-        """Mean error over views, by method, suite, ladder and severity."""
-        errors: dict[tuple, list[float]] = {}
+    def _groups(self) -> dict[tuple[str, str, str], list[Row]]:
+        groups: dict[tuple[str, str, str], list[Row]] = {}
         for row in self.rows:
-            if row["suite"] != FLICKER:
-                key = (row["method"], row["suite"], row["ladder"], row["severity"])
-                errors.setdefault(key, []).append(row["error"])
-        return {key: float(np.mean(values)) for key, values in errors.items()}
+            groups.setdefault((row["method"], row["suite"], row["ladder"]), []).append(row)
+        return groups
+
+    def views(self, method: str, ladder: Ladder, severity: int) -> list[Row]:
+        """Return the rows of a method's views at a severity; none where the ladder does not affect the method."""
+        return [row for row in self._groups.get((method, *ladder), []) if row["severity"] == severity]
 
     def clean(self, method: str) -> float:
         """Return the error on the clean views."""
-        return self._means.get((method, CLEAN, "views", 0), math.nan)
+        return _mean(self.views(method, (CLEAN, "views"), 0), "error")
 
-    def errors(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
-        """Return the errors (S + 1,) by severity, the clean one first; empty where a method is not affected.
+    @cached_property
+    def errors(self) -> dict[Ladder, dict[str, np.ndarray]]:
+        """The mean errors (S + 1,) by severity, the clean one first, of the methods that each ladder affects.
 
-        A negative estimate, which an unbiased one may be, counts as zero.
+        A negative estimate, which an unbiased one may be, counts as zero. Ladders without rows are left out.
         """
-        keys = [(method, *ladder, severity) for severity in range(1, 6)]
-        means = [max(self._means[key], 0.0) for key in keys if key in self._means]
-        return np.array([self.clean(method), *means]) if means else np.zeros(0)
-
-    def error(self, method: str, ladder: tuple[str, str], severity: int) -> float:
-        """Return the error at a severity; the clean error where the ladder does not affect the method."""
-        errors = self.errors(method, ladder)
-        return float(errors[severity]) if len(errors) else self.clean(method)
-
-    def growth(self, method: str, ladder: tuple[str, str]) -> np.ndarray:
-        """Return `errors` (S + 1,) over the clean error."""
-        errors = self.errors(method, ladder)
-        return errors / errors[0] if len(errors) else errors
-
-    def nonfinite(self, method: str) -> int:
-        """Return the number of pixels that are not finite, over all suites."""
-        return int(sum(row["nonfinite"] for row in self.rows if row["method"] == method))
+        errors: dict[Ladder, dict[str, np.ndarray]] = {}
+        ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.suites[suite]]
+        for ladder, method in itertools.product(ladders, self.methods):
+            means = [max(_mean(rows, "error"), 0.0) for k in range(1, 6) if (rows := self.views(method, ladder, k))]
+            if means:
+                errors.setdefault(ladder, {})[method] = np.array([self.clean(method), *means])
+        return errors
 
     def flicker(self, method: str, kind: str) -> float:
         """Return the mean over scenes of a kind's value; NaN where the method is not affected."""
-        values = [r["value"] for r in self.rows if (r["method"], r["suite"], r["ladder"]) == (method, FLICKER, kind)]
-        return float(np.mean(values)) if values else math.nan
+        return _mean(self._groups.get((method, FLICKER, kind), []), "value")
+
+
+def _mean(rows: list[Row], key: str) -> float:
+    return float(np.mean([row[key] for row in rows])) if rows else math.nan
 
 
 def breaking_point(growth: np.ndarray) -> float:
@@ -103,53 +103,33 @@ def load_stress(directory: Path) -> Stressed | None:
     """Read the stress results in a directory; None where there are none."""
     if not (directory / ROWS).exists() or not (directory / MANIFEST).exists():
         return None
-    trainings = directory / TRAININGS
-    return Stressed(
-        directory,
-        json.loads((directory / MANIFEST).read_text()),
-        read_rows(directory / ROWS),
-        read_rows(trainings) if trainings.exists() else [],
-    )
+    trainings = read_rows(directory / TRAININGS) if (directory / TRAININGS).exists() else []
+    return Stressed(directory, json.loads((directory / MANIFEST).read_text()), read_rows(directory / ROWS), trainings)
 
 
 def write_stress(stressed: Stressed) -> None:
     """Write breaking.csv and stress.md."""
     write_rows(stressed.directory / BREAKING, _rows(stressed))
-    write_bytes(stressed.directory / TEXT, _text(stressed).encode())
-
-
-def _rows(stressed: Stressed) -> list[dict[str, Any]]:
-    """Return a row per method and ladder: errors, their growth and ranks by severity, and the breaking point."""
-    rows = []
-    for ladder in stressed.ladders:
-        errors = {m: e for m in stressed.methods if len(e := stressed.errors(m, ladder))}
-        ranks = dict(zip(errors, _ranks(list(errors.values())), strict=True))
-        for method, own in errors.items():
-            growth = stressed.growth(method, ladder)
-            row: dict[str, Any] = {"method": method, "suite": ladder[0], "ladder": ladder[1]}
-            row |= {f"error_{k}": value for k, value in enumerate(own)}
-            row |= {f"growth_{k}": value for k, value in enumerate(growth)}
-            row |= {f"rank_{k}": int(rank) for k, rank in enumerate(ranks[method])}
-            rows.append(row | {"breaks_at": breaking_point(growth)})
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    return [{key: row[key] for key in columns if key in row} for row in rows]
-
-
-def _ranks(errors: list[np.ndarray]) -> np.ndarray:
-    """Return the ranks (methods, severities), 1 for the lowest error."""
-    return scipy.stats.rankdata(np.stack(errors), axis=0, method="min")
-
-
-# --- in words ---
-
-
-def _text(stressed: Stressed) -> str:
-    lines = ["# Where methods fail", "", introduction(stressed), ""]
-    for paragraph in paragraphs(stressed):
+    lines = ["# Where methods fail", ""]
+    for paragraph in (introduction(stressed), *(about(stressed, method) for method in stressed.methods)):
         lines += [paragraph, ""]
     for table in tables(stressed):
-        lines += as_markdown(table, 2)
-    return "\n".join([*lines, f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}."]) + "\n"
+        lines += section(table)
+    lines += [f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}.", ""]
+    write_bytes(stressed.directory / TEXT, "\n".join(lines).encode())
+
+
+def _rows(stressed: Stressed) -> list[Row]:
+    """Return a row per method and ladder: errors, their growth and ranks by severity, and the breaking point."""
+    rows = []
+    for (suite, name), errors in stressed.errors.items():
+        ranks = scipy.stats.rankdata(list(errors.values()), axis=0, method="min").astype(int)
+        for (method, own), own_ranks in zip(errors.items(), ranks, strict=True):
+            row: Row = {"method": method, "suite": suite, "ladder": name}
+            for column, values in {"error": own, "growth": own / own[0], "rank": own_ranks}.items():
+                row |= {f"{column}_{k}": value for k, value in enumerate(values)}
+            rows.append(row | {"breaks_at": breaking_point(own / own[0])})
+    return rows
 
 
 def introduction(stressed: Stressed) -> str:
@@ -158,16 +138,45 @@ def introduction(stressed: Stressed) -> str:
     return (
         f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: at each severity "
         f"{manifest['views']} of each scene's views ({', '.join(manifest['scenes'])}), "
-        f"suites of version {manifest['manifest']['version']}. "
+        f"suites of version {stressed.suites['version']}. "
         "Errors are squared, relative to the reference's square (plus 0.01) at each pixel, without the reference's "
         "noise; a method breaks where its error is twice that of the clean views."
         + (f" Left out: {'; '.join(manifest['left_out'])}." if manifest["left_out"] else "")
     )
 
 
-def paragraphs(stressed: Stressed) -> list[str]:
-    """Return a Markdown paragraph for each method."""
-    return [_about(stressed, method) for method in stressed.methods]
+def about(stressed: Stressed, method: str) -> str:
+    """Return a Markdown paragraph: where and how much a method breaks, which is better there, what it withstands."""
+    errors = {ladder: own for ladder, errors in stressed.errors.items() if (own := errors.get(method)) is not None}
+    points = {ladder: breaking_point(own / own[0]) for ladder, own in errors.items()}
+    broken = sorted((at, ladder) for ladder, at in points.items() if math.isfinite(at))
+    held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
+    parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
+    parts += [_break(stressed, method, ladder, at) for at, ladder in broken[:5]]
+    if len(broken) > 5:
+        rest = ", ".join(f"{stressed.says(ladder)} ({at:.1f})" for at, ladder in broken[5:])
+        parts.append(f"Further, it breaks with {rest}.")
+    if held:
+        parts.append(f"It withstands: {', '.join(held)}.")
+    bad = int(sum(row["nonfinite"] for row in stressed.rows if row["method"] == method))
+    parts.append(f"**{bad} pixels are not finite.**" if bad else "Every output is finite.")
+    return " ".join(parts)
+
+
+def _break(stressed: Stressed, method: str, ladder: Ladder, at: float) -> str:
+    """Return a sentence on a ladder that breaks a method at severity `at`, and on the best other method there."""
+    errors = stressed.errors[ladder]
+    worst = int(errors[method].argmax())  # not always the highest severity: a camera very close to a wall sees little
+    at_worst = {m: errors[m][worst] if m in errors else stressed.clean(m) for m in stressed.methods}
+    own = at_worst.pop(method)
+    best = min(at_worst, key=at_worst.__getitem__, default=None)
+    advice = ""
+    if best is not None and at_worst[best] < own:
+        advice = f"; there {label(best)} has {at_worst[best]:.3g} against its {own:.3g}"
+    elif best is not None:
+        advice = f"; yet no other method has less than its {own:.3g} there"
+    times = f"{own / errors[method][0]:.3g} times the clean error at severity {worst}"
+    return f"It breaks with {stressed.says(ladder)} at severity {at:.1f} ({times}{advice})."
 
 
 def tables(stressed: Stressed) -> list[Table]:
@@ -176,46 +185,12 @@ def tables(stressed: Stressed) -> list[Table]:
     return [table for table in all_tables if table.rows]
 
 
-def _about(stressed: Stressed, method: str) -> str:
-    """Return a paragraph: where a method breaks, by how much, which is better there, and the changes it withstands."""
-    points = {ladder: breaking_point(g) for ladder in stressed.ladders if len(g := stressed.growth(method, ladder))}
-    broken = sorted((at, ladder) for ladder, at in points.items() if math.isfinite(at))
-    held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
-    parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
-    for at, ladder in broken[:5]:
-        growth = stressed.growth(method, ladder)
-        worst = int(growth.argmax())  # not always the highest severity: a camera very close to a wall sees little
-        own = stressed.error(method, ladder, worst)
-        rivals = {m: stressed.error(m, ladder, worst) for m in stressed.methods if m != method}
-        best = min(rivals, key=rivals.__getitem__, default=None)
-        advice = ""
-        if best is not None and rivals[best] < own:
-            advice = f"; there {label(best)} has {rivals[best]:.3g} against its {own:.3g}"
-        elif best is not None:
-            advice = f"; yet no other method has less than its {own:.3g} there"
-        parts.append(
-            f"It breaks with {stressed.says(ladder)} at severity {at:.1f} "
-            f"({growth[worst]:.3g} times the clean error at severity {worst}{advice})."
-        )
-    if len(broken) > 5:
-        rest = ", ".join(f"{stressed.says(ladder)} ({at:.1f})" for at, ladder in broken[5:])
-        parts.append(f"Further, it breaks with {rest}.")
-    if held:
-        parts.append(f"It withstands: {', '.join(held)}.")
-    bad = stressed.nonfinite(method)
-    parts.append(f"**{bad} pixels are not finite.**" if bad else "Every output is finite.")
-    return " ".join(parts)
-
-
 def _breaking(stressed: Stressed) -> Table:
     rows = []
-    for ladder in stressed.ladders:
-        cells = []
-        for method in stressed.methods:
-            growth = stressed.growth(method, ladder)
-            at = breaking_point(growth)
-            cells.append(f"{severity(at, len(growth) - 1)} ({growth[-1]:.2g})" if len(growth) else _NONE)
-        rows.append([f"{ladder[0]}: {stressed.says(ladder)}", *cells])
+    for ladder, errors in stressed.errors.items():
+        growths = [errors[method] / errors[method][0] if method in errors else None for method in stressed.methods]
+        cells = [_NONE if g is None else f"{severity(breaking_point(g), len(g) - 1)} ({g[-1]:.2g})" for g in growths]
+        rows.append([stressed.title(ladder), *cells])
     note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
     return Table("Breaking points", note, [label(method) for method in stressed.methods], rows, first="ladder")
 
@@ -228,13 +203,12 @@ def severity(at: float, highest: int) -> str:
 def _ranking(stressed: Stressed) -> Table:
     """Compare the order of the methods at the highest severity with that on the clean views."""
     rows = []
-    for ladder in stressed.ladders:
-        errors = {m: e for m in stressed.methods if len(e := stressed.errors(m, ladder))}
+    for ladder, errors in stressed.errors.items():
         if len(errors) > 1:
-            names, values = list(errors), np.stack(list(errors.values()))
-            tau = scipy.stats.kendalltau(values[:, 0], values[:, -1]).statistic
-            first, last = (label(names[int(values[:, k].argmin())]) for k in (0, -1))
-            rows.append([f"{ladder[0]}: {stressed.says(ladder)}", first, last, _number(tau, ".2f")])
+            values = np.stack(list(errors.values()))[:, [0, -1]]
+            tau = scipy.stats.kendalltau(*values.T).statistic
+            best = [label(list(errors)[k]) for k in values.argmin(0)]
+            rows.append([stressed.title(ladder), *best, _number(tau, ".2f")])
     columns = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
     return Table("Ranks", "", columns, rows, first="ladder")
 
@@ -242,10 +216,8 @@ def _ranking(stressed: Stressed) -> Table:
 def _flicker(stressed: Stressed) -> Table:
     rows = []
     for method in stressed.methods if any(row["suite"] == FLICKER for row in stressed.rows) else ():
-        draws = [100 * stressed.flicker(method, kind) for kind in _FLICKERS]
-        moves = [stressed.flicker(method, kind) for kind in PATHS]
-        cells = [_number(v, ".2f") for v in draws] + [_number(v) for v in moves]
-        rows.append([label(method), *cells])
+        draws = [_number(100 * stressed.flicker(method, kind), ".2f") for kind in _FLICKERS]
+        rows.append([label(method), *draws, *(_number(stressed.flicker(method, kind)) for kind in PATHS)])
     note = (
         "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
         "square change from frame to frame on a smooth path, over the reference's."
@@ -256,7 +228,7 @@ def _flicker(stressed: Stressed) -> Table:
 def _training(stressed: Stressed) -> Table:
     rows, trained = [], stressed.trainings
     kinds = list(dict.fromkeys((r["variation"], str(r["value"])) for r in trained if r["variation"] != "seed"))
-    content = stressed.manifest["manifest"]["training"]
+    content = stressed.suites["training"]
     for method in dict.fromkeys(row["method"] for row in trained):
         own = [row for row in trained if row["method"] == method]
         seeds = np.array([row["error"] for row in own if row["variation"] == "seed" and row["status"] == OK])
