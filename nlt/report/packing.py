@@ -1,61 +1,55 @@
-"""Packing of HDR images for report.html; page_parts/report.js unpacks them.
+"""HDR images as WebP pictures for report.html, which a browser decodes; page_parts/report.js reads the values back.
 
-A value, radiance × exposure, is divided by 16 and stored as a half float, which makes it linear below 2^-10 and
-logarithmic above. The half's bits, as a signed integer, are rounded to `dropped` fewer bits. Red and blue are stored
-minus green, and every plane minus its prediction from the left and upper neighbours (LOCO-I, Weinberger et al. 2000);
-the result is deflated. Every value is recovered to within `max_error`.
+A value x, radiance × exposure, becomes the integer steps · asinh(x / SMALLEST), which is linear below SMALLEST and
+logarithmic above. The picture holds these integers without loss: the high bytes in its upper half, the low bytes below.
 """
 
 from __future__ import annotations
 
-import zlib
+import base64
+import io
+import json
 
 import numpy as np
+from PIL import Image
 
-_SCALE = 2.0**-4
-_LARGEST = 0x7BFF  # the bits of the largest finite half
-COARSEST = 6
-
-
-def max_error(dropped: int) -> float:
-    """Return the largest error of a packed value x, relative to max(|x|, 2^-10), for |x| up to 2^19."""
-    return 2.0**-11 * (2**dropped + (dropped > 0))
+SMALLEST = 2.0**-10
+LARGEST = 2.0**19
+STEPS = (1024, 512, 256, 128, 64, 32, 16)  # the finest is as precise as half floats
 
 
-def pack(images: np.ndarray, dropped: int) -> bytes:
-    """Return finite images (K, 3, H, W), clamped to ±2^20, as packed bytes."""
-    limit = float(np.finfo(np.float16).max)
-    bits = np.clip(images.astype(np.float32) * _SCALE, -limit, limit).astype(np.float16).view(np.int16).astype(np.int32)
-    ordered = np.where(bits < 0, -(bits & 0x7FFF), bits)
-    code = (ordered + ((1 << dropped) >> 1)) >> dropped
-    code = np.clip(code, -(_LARGEST >> dropped), _LARGEST >> dropped)
-    code[:, 0::2] = _wrap(code[:, 0::2] - code[:, 1:2])
-    around = np.pad(code, ((0, 0), (0, 0), (1, 0), (1, 0)))
-    left, up, corner = around[..., 1:, :-1], around[..., :-1, 1:], around[..., :-1, :-1]
-    low, high = np.minimum(left, up), np.maximum(left, up)
-    residual = _wrap(code - np.clip(left + up - corner, low, high))
-    unsigned = ((residual << 1) ^ (residual >> 31)).astype("<u2")
-    planes = unsigned.reshape(-1, 1).view(np.uint8).T.tobytes()  # all low bytes, then all high bytes
-    deflate = zlib.compressobj(6, memLevel=9, strategy=zlib.Z_FILTERED)
-    return deflate.compress(planes) + deflate.flush()
+def max_error(steps: int) -> float:
+    """Return the largest error of a packed value x, relative to (x² + SMALLEST²)^½, for |x| up to LARGEST."""
+    return 0.5 / steps
 
 
-def _wrap(value: np.ndarray) -> np.ndarray:
-    return value.astype(np.int16).astype(np.int32)
+def pack(image: np.ndarray, steps: int) -> str:
+    """Return a finite image (3, H, W), clamped to ±LARGEST, as the data URL of a picture of W × 2 H pixels."""
+    values = np.clip(image.astype(np.float64), -LARGEST, LARGEST)
+    codes = np.rint(steps * np.arcsinh(values / SMALLEST)).astype(int) + 0x8000
+    planes = np.concatenate([codes >> 8, codes & 0xFF], axis=1).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(planes.transpose(1, 2, 0)).save(file, "WEBP", lossless=True, method=1)
+    return data_url(file.getvalue(), "image/webp")
 
 
-def pack_to_fit(views: list[np.ndarray], size: int) -> tuple[list[bytes], int]:
-    """Return as many of the views, each (K, 3, H, W), as fit into `size` bytes, and the number of bits dropped.
+def data_url(content: bytes, mime: str) -> str:
+    """Return a file's content as a URL that a page embeds."""
+    return f"data:{mime};base64,{base64.b64encode(content).decode()}"
 
-    Precision is reduced before views are left out. The first view's size predicts that of the others.
+
+def pack_to_fit(views: list[np.ndarray], size: int) -> tuple[list[list[str]], int]:
+    """Return the packed images of as many views, each (K, 3, H, W), as fit into `size` characters, and the steps.
+
+    Precision is reduced before views are left out. The first view always stays; its size predicts that of the others.
     """
-    first_sizes = [len(pack(views[0], dropped)) for dropped in range(COARSEST + 1)]
+    first = {steps: [pack(image, steps) for image in views[0]] for steps in STEPS}
     count = len(views)
-    while count > 1:
-        for dropped, expected in enumerate(first_sizes):
-            if count * expected <= 1.1 * size:
-                packed = [pack(view, dropped) for view in views[:count]]
-                if sum(map(len, packed)) <= size:
-                    return packed, dropped
+    while count:
+        for steps, images in first.items():
+            if count * len(json.dumps(images)) <= 1.1 * size:
+                packed = [images, *([pack(image, steps) for image in view] for view in views[1:count])]
+                if len(json.dumps(packed)) <= size:
+                    return packed, steps
         count //= 2
-    return [pack(views[0], COARSEST)], COARSEST
+    return [first[STEPS[-1]]], STEPS[-1]

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 import re
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
-from html import escape
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import matplotlib
 import numpy as np
 import yaml
-from PIL import Image
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup, escape
 
 from nlt.data.files import write_bytes
 from nlt.evaluation.claims import BELOW_FLOOR, Claim, Inequality
@@ -27,14 +26,13 @@ from nlt.evaluation.results import OK, TIMES, Results
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 from nlt.report.figures import bar, curves
 from nlt.report.gallery import FAILURES, Shown, failures
-from nlt.report.packing import max_error, pack_to_fit
+from nlt.report.packing import SMALLEST, data_url, max_error, pack_to_fit
 from nlt.report.table_writer import Table
 from nlt.report.tables import tables
 
 PAGE = "report.html"
 _PARTS = Path(__file__).parent / "page_parts"
 _MEGABYTES = 25  # maximum size of the file
-_OTHER = 500_000  # bytes reserved for the data on images and methods
 _AXES = ("time_per_frame_s", "flops", "parameters", "peak_memory_bytes")
 _RUN = ("seed", "status", "message", "steps", "trained_at_commit", "run")
 _MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not measured": "–"}
@@ -42,7 +40,6 @@ _FILES = (
     *("table.csv", "table.md", "table.tex", "runs.csv", "timings.csv", "views.csv"),
     *("failures.csv", "failures.md", "failures.tex", "claims.md", "claims.json", "manifest.json"),
 )
-_WEBP = 90  # quality of embedded pixel figures; the originals are in the report's directory
 
 
 @dataclass(frozen=True)
@@ -62,6 +59,24 @@ class Section:
     source: str
 
 
+@dataclass(frozen=True)
+class _Grid:
+    """A sortable table of the page, with the origin of all its numbers and of those in a column, a row or a cell."""
+
+    id: str
+    table: Table
+    origin: str
+    column_origins: Sequence[str] = ()
+    row_origins: Sequence[str] = ()
+    cell_origins: Sequence[Sequence[str]] = ()
+    best: Collection[tuple[int, int]] = ()  # (row, column) of bold cells
+
+    @property
+    def directions(self) -> list[str]:
+        """Whether lower or higher values are better, for each column."""
+        return [QUANTITIES[key].direction for key, _ in self.table.sources] or ["lower"] * len(self.table.columns)
+
+
 def write_page(
     results: Results, claims: list[Claim], megabytes: float | None = None, sections: Iterable[Section | None] = ()
 ) -> None:
@@ -70,57 +85,76 @@ def write_page(
     The number and the precision of the images, of at least one view, are chosen so that the file stays below
     `megabytes` (10^6 bytes; default: 25). `None` in `sections` is skipped.
     """
-    megabytes = megabytes or _MEGABYTES
-    manifest = results.manifest
-    title = str(manifest.get("comparison", "Comparison"))
-    if manifest["table"]:
-        title += f": {paper()[manifest['table']]['title']}"
-    parts = {
-        "title": escape(title),
-        "summary": _summary(results),
-        "style": (_PARTS / "report.css").read_text(),
-        "script": (_PARTS / "report.js").read_text(),
-        "claims": _claims(results, claims),
-        "tables": "\n".join(_table(results, table, number) for number, table in enumerate(tables(results))),
-        "failures": _failures(results),
-        "files": _files(results.directory, _FILES),
-        "figures": _figures(results.directory),
-        "sections": "\n".join(_section(section) for section in sections if section),
-        "provenance": _provenance(results),
-    }
-    packed, data = _images(results, int(megabytes * 1e6) - sum(map(len, parts.values())) - _OTHER)
+    limit = megabytes or _MEGABYTES
+    name = str(results.manifest.get("comparison", "Comparison"))
+    views, data = _images(results)
     data |= {"methods": _methods(results), "curves": curves(results), "quantities": _quantities(results)}
     data |= {"stages": list(STAGES), "devices": results.devices}
-    images = "\n".join(
-        f'<script type="text/plain" id="images-{k}">{base64.b64encode(view).decode()}</script>'
-        for k, view in enumerate(packed)
-    )
-    page = Template((_PARTS / "template.html").read_text())
-    text = page.substitute(parts, precision=_precision(results, data, megabytes), data=_json(data), images=images)
-    write_bytes(results.directory / PAGE, text.encode())
+    content = {
+        "results": results,
+        "title": f"{name}: {paper()[table]['title']}" if (table := results.manifest["table"]) else name,
+        "facts": _facts(results),
+        "problems": [f"{label(m)}: {results.status(m)}" for m in results.methods if results.status(m) != OK],
+        "marks": _MARKS,
+        "counts": Counter(claim.verdict for claim in claims),
+        "claims": [(claim, claim_text(claim), _claim_grid(results, claim)) for claim in claims],
+        "grids": [_results_grid(results, table, number) for number, table in enumerate(tables(results))],
+        "failures": _failures_grid(results),
+        "table_files": _FILES,
+        "sections": [
+            (section, [_Grid(f"{section.name}-{k}", table, section.source) for k, table in enumerate(section.tables)])
+            for section in sections
+            if section
+        ],
+        "runs": _runs_grid(results),
+        "style": Markup((_PARTS / "report.css").read_text()),
+        "script": Markup((_PARTS / "report.js").read_text()),
+    }
+    page = partial(_environment().get_template("template.html").render, content)
+    if views:
+        frame = page(data=data, note=_note(results, data, limit))
+        data["pictures"], data["steps"] = pack_to_fit(views, int(limit * 1e6) - len(frame.encode()))
+        data["views"] = data["views"][: len(data["pictures"])]
+    write_bytes(results.directory / PAGE, page(data=data, note=_note(results, data, limit)).encode())
+
+
+def _environment() -> Environment:
+    """Return what renders the template; text that is not `Markup` is escaped."""
+    environment = Environment(loader=FileSystemLoader(_PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    to_json = partial(json.dumps, separators=(",", ":"), allow_nan=False)
+    environment.filters |= {
+        "label": label,
+        "plain": _plain,
+        "marked_up": _marked_up,
+        "figures": _figures,
+        "yaml": partial(yaml.safe_dump, sort_keys=False),
+        "script_json": lambda data: Markup(to_json(data).replace("</", "<\\/")),
+        "data_url": lambda path: data_url(path.read_bytes(), "text/plain"),
+    }
+    return environment
 
 
 # --- data of the script ---
 
 
-def _json(data: Any) -> str:
-    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
-
-
 def _quantities(results: Results) -> dict[str, dict[str, Any]]:
     everywhere = [results.on(device) for device in results.devices]
     measured = [key for key in QUANTITIES if any(len(on.values(m, key)) for on in everywhere for m in results.methods)]
-    return {
+    quantities = {
         key: {
             "heading": heading(key),
+            "axis": heading(key),
             "direction": QUANTITIES[key].direction,
-            "scale": QUANTITIES[key].scale * (1e3 if key == "time_per_frame_s" else 1),
-            "unit": "ms" if key == "time_per_frame_s" else QUANTITIES[key].unit,
+            "scale": QUANTITIES[key].scale,
+            "unit": QUANTITIES[key].unit,
             "role": "metric" if key in METRICS and key != "reference_noise" else "cost" if key in _AXES else "",
             "per_image": QUANTITIES[key].per_image,
         }
         for key in measured
     }
+    if time := quantities.get("time_per_frame_s"):
+        time |= {"axis": "time per frame (ms)", "unit": "ms", "scale": 1e3}
+    return quantities
 
 
 def _methods(results: Results) -> list[dict[str, Any]]:
@@ -147,44 +181,37 @@ def _values(results: Results, method: str, keys: Iterable[str]) -> dict[str, lis
     return values
 
 
-def _images(results: Results, size: int) -> tuple[list[bytes], dict[str, Any]]:
-    """Return the packed images of each view, and the data that the script needs to unpack and label them."""
-    stored = {name: results.images(name) for name in ("reference", "noisy", "gbuffer", *results.methods)}
-    reference, gbuffer = stored["reference"], stored["gbuffer"]
+def _images(results: Results) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """Return the images of each view, (K, 3, H, W), radiance times exposure, and what the script needs to show them."""
+    reference, gbuffer = results.images("reference"), results.images("gbuffer")
     if reference is None:
         return [], {"images": [], "views": []}
     exposure = reference["exposure"].astype(np.float32).reshape(-1, 1, 1, 1)
-    listed = [("reference", "Reference"), ("noisy", "Training image (1 spp)")]
-    listed += [(method, label(method)) for method in results.methods if results.runs_of(method)]
+    titles = {"reference": "Reference", "noisy": "Training image (1 spp)"}
+    titles |= {method: label(method) for method in results.methods if results.runs_of(method)}
     images: dict[str, tuple[str, str, np.ndarray]] = {
         name: (title, "radiance", arrays["radiance"] * exposure)
-        for name, title in listed
-        if (arrays := stored[name]) is not None
+        for name, title in titles.items()
+        if (arrays := results.images(name)) is not None
     }
     if gbuffer is not None:
         images["albedo"] = ("Albedo", "albedo", gbuffer["albedo"])
         images["normal"] = ("Normals", "normal", gbuffer["normal"] / 2 + 0.5)
-    views = [np.stack([array[v] for _, _, array in images.values()]) for v in range(len(reference["view"]))]
-    packed, dropped = pack_to_fit(views, size * 3 // 4)  # leaves room for base64
-    height, width = views[0].shape[-2:]
+    views = [np.stack(arrays) for arrays in zip(*(array for _, _, array in images.values()), strict=True)]
     displayed = Shown.load(results)
-    return packed, {
+    return views, {
         "images": [{"id": name, "label": title, "kind": kind} for name, (title, kind, _) in images.items()],
-        "height": height,
-        "width": width,
-        "dropped": dropped,
+        "height": views[0].shape[-2],
+        "width": views[0].shape[-1],
+        "smallest": SMALLEST,
+        "steps": 1,
         "stored": len(views),
+        "pictures": [],
         "error_scale": float(f"{displayed.scale:.3g}") if displayed else 1.0,
-        "colours": base64.b64encode(
-            matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].tobytes()
-        ).decode(),
+        "colours": matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].tolist(),
         "views": [
-            {
-                "view": int(view),
-                "exposure": float(reference["exposure"][k]),
-                "metrics": _view_metrics(results, int(view), list(images)),
-            }
-            for k, view in enumerate(reference["view"][: len(packed)])
+            {"view": int(view), "exposure": float(e), "metrics": _view_metrics(results, int(view), list(images))}
+            for view, e in zip(reference["view"], reference["exposure"], strict=True)
         ],
     }
 
@@ -207,7 +234,7 @@ def _view_metrics(results: Results, view: int, names: list[str]) -> dict[str, di
 # --- parts of the page that need no script ---
 
 
-def _summary(results: Results) -> str:
+def _facts(results: Results) -> list[str]:
     manifest = results.manifest
     seeds = len(manifest["seeds"])
     facts = [
@@ -218,9 +245,7 @@ def _summary(results: Results) -> str:
         manifest.get("device", ""),
         f"commit {_commit(manifest)}",
     ]
-    problems = [f"{label(m)}: {results.status(m)}" for m in results.methods if results.status(m) != OK]
-    warning = f'<p class="warning" role="note">{escape("; ".join(problems))}</p>' if problems else ""
-    return f"<p>{' · '.join(escape(fact) for fact in facts if fact)}</p>{warning}"
+    return [fact for fact in facts if fact]
 
 
 def _commit(manifest: Any) -> str:
@@ -228,62 +253,22 @@ def _commit(manifest: Any) -> str:
     return commit + (" with uncommitted changes" if manifest.get("uncommitted_changes") else "")
 
 
-@dataclass(frozen=True)
-class _Origins:
-    """The provenance of a grid's numbers: of the table, each column, row and cell; report.js joins them."""
-
-    table: str
-    columns: list[str]
-    rows: list[str] = field(default_factory=list)
-    cells: list[list[str]] = field(default_factory=list)
-
-
-def _grid(name: str, title: str, table: Table, origins: _Origins, best: Collection[tuple[int, int]] = ()) -> str:
-    """Return a sortable table with keyboard navigation as HTML; `best` has the (row, column) of bold cells."""
-    origin = lambda note: f' data-origin="{escape(note)}"' if note else ""
-    directions = [QUANTITIES[key].direction for key, _ in table.sources] or ["lower"] * len(table.columns)
-    rows = []
-    for r, (head, *row) in enumerate(table.rows):
-        cells = "".join(
-            f"<td{' class=best' * ((r, c) in best)}{origin(origins.cells[r][c] if origins.cells else '')}>"
-            f"{escape(cell)}</td>"
-            for c, cell in enumerate(row)
-        )
-        row_origin = origin(origins.rows[r] if origins.rows else "")
-        rows.append(f'<tr data-index="{r}"{row_origin}><th scope="row">{escape(head)}</th>{cells}</tr>')
-    headings = zip([table.first, *table.columns], ["lower", *directions], ["", *origins.columns], strict=True)
-    return (
-        f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(title)}">'
-        f'<table class="grid" id="{escape(name)}" aria-label="{escape(title)}"{origin(origins.table)}><thead><tr>'
-        + "".join(
-            f'<th scope="col" data-direction="{direction}"{origin(note)}>'
-            f'<button type="button">{escape(column)}</button></th>'
-            for column, direction, note in headings
-        )
-        + f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
-    )
-
-
-def _titled(table: Table, grid: str) -> str:
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return f"<h3>{escape(table.title)}</h3>{note}{grid}"
-
-
-def _table(results: Results, table: Table, number: int) -> str:
-    """Return a table of results as HTML, with the best value of each metric in bold."""
+def _results_grid(results: Results, table: Table, number: int) -> _Grid:
+    """Return a table of results, with the best value of each metric in bold."""
     keys = [key for key, _ in table.sources]
-    chosen = [(results.best(key), c) for c, key in enumerate(keys) if key in METRICS]
-    best = {(results.methods.index(method), c) for method, c in chosen if method is not None}
-    origins = _Origins(
+    chosen = [(results.best(key), column) for column, key in enumerate(keys) if key in METRICS]
+    return _Grid(
+        f"table-{number}",
+        table,
         _measurement(results),
         [_column_origin(results, *source) for source in table.sources],
-        [_training_lines(results, method) for method in results.methods],
-        [[_exact_values(source, method, key) for key, source in table.sources] for method in results.methods],
+        [*(_training_lines(results, method) for method in results.methods), "manifest.json, floor"],
+        [
+            *([_exact_values(source, method, key) for key, source in table.sources] for method in results.methods),
+            [repr(results.floor.get(key, "not measured")) for key in keys],
+        ],
+        {(results.methods.index(method), column) for method, column in chosen if method is not None},
     )
-    if len(table.rows) > len(results.methods):
-        origins.rows.append("manifest.json, floor")
-        origins.cells.append([repr(results.floor.get(key, "not measured")) for key, _ in table.sources])
-    return _titled(table, _grid(f"table-{number}", table.title, table, origins, best))
 
 
 def _measurement(results: Results) -> str:
@@ -328,94 +313,20 @@ def _exact_values(results: Results, method: str, key: str) -> str:
     return "; ".join(parts) if parts else f"not measured; {results.status(method)}"
 
 
-def _failures(results: Results) -> str:
-    """Return the table of failures as HTML; empty if there is none."""
+def _failures_grid(results: Results) -> _Grid | None:
     table = failures(results)
     if table is None:
-        return ""
+        return None
+    origin = f"images/*.npz of seed {results.manifest['seeds'][0]}; {_measurement(results)}"
     columns = [f"{FAILURES}, share_of_worst and pixels of the cause {cause}" for cause in table.columns]
-    origins = _Origins(f"images/*.npz of seed {results.manifest['seeds'][0]}; {_measurement(results)}", columns)
-    return _titled(table, _grid("failures", table.title, table, origins))
+    return _Grid("failures", table, origin, columns)
 
 
-def _section(section: Section) -> str:
-    """Return another feature's section as HTML."""
-    heading = f'<h2 id="{section.name}-title">{escape(section.title)}</h2>'
-    parts = [f'<section id="{section.name}" aria-labelledby="{section.name}-title">', heading]
-    parts += [f"<p>{_marked_up(text)}</p>" for text in section.paragraphs]
-    for number, table in enumerate(section.tables):
-        origins = _Origins(section.source, [""] * len(table.columns))
-        parts.append(_titled(table, _grid(f"{section.name}-{number}", table.title, table, origins)))
-    files = f'<p class="note">Files: {_files(section.directory, section.files)}.</p>'
-    return "\n".join([*parts, _figures(section.directory), files, "</section>"])
-
-
-def _marked_up(text: str) -> str:
-    """Return Markdown with strong text and code converted to HTML."""
-    code = re.sub(r"`(.*?)`", r"<code>\1</code>", escape(text))
-    return re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", code)
-
-
-def _figures(directory: Path) -> str:
-    """Return the directory's figures as HTML, SVG preferred."""
-    kinds = (".png", ".svg", ".webp")
-    paths = {path.stem: path for path in sorted(directory.glob("*.*")) if path.suffix in kinds}  # .svg after .png
-    return "\n".join(
-        f'<figure><img alt="{escape(name.replace("_", " "))}" src="{_picture(path)}">'
-        f"<figcaption>{escape(name.replace('_', ' ').capitalize())}</figcaption></figure>"
-        for name, path in paths.items()
-    )
-
-
-def _picture(path: Path) -> str:
-    if path.suffix == ".svg":
-        return _url(path.read_bytes(), "image/svg+xml")
-    if path.suffix == ".webp":
-        return _url(path.read_bytes(), "image/webp")
-    webp = io.BytesIO()
-    Image.open(path).convert("RGB").save(webp, "WEBP", quality=_WEBP)
-    return _url(webp.getvalue(), "image/webp")
-
-
-def _url(content: bytes, mime: str) -> str:
-    return f"data:{mime};base64,{base64.b64encode(content).decode()}"
-
-
-def _files(directory: Path, names: Iterable[str]) -> str:
-    """Return links with embedded files of tables and raw numbers."""
-    paths = [path for name in names if (path := directory / name).exists()]
-    return ", ".join(
-        f'<a download="{path.name}" href="{_url(path.read_bytes(), "text/plain")}">{path.name}</a>' for path in paths
-    )
-
-
-def _claims(results: Results, claims: list[Claim]) -> str:
-    """Return a line per claim that opens to its comparisons; empty if the results' table has no claims."""
-    if not claims:
-        return ""
-    verdicts = [claim.verdict for claim in claims]
-    count = ", ".join(f"{v}: {verdicts.count(v)}" for v in _MARKS if v in verdicts)
-    lines = []
-    for claim in claims:
-        table = Table(
-            claim.id,
-            "",
-            ["against", "metric", "margin", "verdict"],
-            [[label(c.method), label(c.other), heading(c.metric), _margin(c), _verdict(c)] for c in claim.comparisons],
-        )
-        origins = _Origins(f"claims.json; computed from runs.csv and views.csv, {_measurement(results)}", [""] * 4)
-        lines.append(
-            f'<details id="{escape(claim.id)}"><summary><span class="verdict {claim.verdict.replace(" ", "-")}">'
-            f"{_MARKS[claim.verdict]} {claim.verdict}</span> {escape(claim.says)}</summary>"
-            f'<p class="note">{escape(claim.where)}. Deciding comparison: {escape(claim_text(claim))}.</p>'
-            + _grid(f"comparisons-{claim.id}", f"Comparisons of {claim.id}", table, origins)
-            + "</details>"
-        )
-    return (
-        '<section id="claims" aria-labelledby="claims-title"><h2 id="claims-title">Claims of the paper</h2>'
-        f'<p class="note">At this scale: {count}. A positive margin supports the claim; in brackets is its 95% '
-        f"interval over test images and seeds. Click on a claim to see its comparisons.</p>{''.join(lines)}</section>"
-    )
+def _claim_grid(results: Results, claim: Claim) -> _Grid:
+    rows = [[label(c.method), label(c.other), heading(c.metric), _margin(c), _verdict(c)] for c in claim.comparisons]
+    table = Table(f"Comparisons of {claim.id}", "", ["against", "metric", "margin", "verdict"], rows)
+    origin = f"claims.json; computed from runs.csv and views.csv, {_measurement(results)}"
+    return _Grid(f"comparisons-{claim.id}", table, origin)
 
 
 def _verdict(comparison: Inequality) -> str:
@@ -429,48 +340,53 @@ def _margin(comparison: Inequality) -> str:
     return f"{comparison.margin:+.3g} [{comparison.low:+.3g}, {comparison.high:+.3g}]"
 
 
-def _precision(results: Results, data: dict[str, Any], megabytes: float) -> str:
+def _runs_grid(results: Results) -> _Grid:
+    """Return the table of all runs with their unrounded numbers."""
+    keys = [key for key in QUANTITIES if any(math.isfinite(run.get(key, math.nan)) for run in results.runs)]
+    rows = [
+        [run["method"], *(_plain(run.get(name)) for name in _RUN), *(text(key, run.get(key)) for key in keys)]
+        for run in results.runs
+    ]
+    columns = [f"runs.csv, column {name}" for name in (*_RUN, *keys)]
+    cells = [["" for _ in _RUN] + [_plain(run.get(key)) for key in keys] for run in results.runs]
+    table = Table("All runs", "", [*_RUN, *map(heading, keys)], rows)
+    return _Grid("runs", table, _measurement(results), columns, cell_origins=cells)
+
+
+def _note(results: Results, data: dict[str, Any], megabytes: float) -> str:
+    """Return what the page says about the number and the precision of its images."""
     if not data["views"]:
         return "No images are stored with these results; they are in images/ on the machine that made them."
-    error = max_error(data["dropped"])
-    subset = f"{len(data['views'])} of {data['stored']} stored views, so that this file stays below {megabytes:g} MB; "
+    shown, stored = len(data["pictures"]), data["stored"]
+    subset = f"{shown} of {stored} stored views, so that this file stays below {megabytes:g} MB; "
+    error = max_error(data["steps"])
     return (
-        (subset if len(data["views"]) < data["stored"] else f"{data['stored']} views; ")
+        (subset if shown < stored else f"{stored} views; ")
         + f"linear radiance accurate to {100 * error:.2g} % ({255 * 1.055 / 2.4 * error:.2g} of 255 display levels); "
         f"images and their metrics are from seed {results.manifest['seeds'][0]}."
     )
 
 
-def _provenance(results: Results) -> str:
-    manifest = dict(results.manifest)
-    configs = manifest.pop("configs", {})
-    facts = "".join(f"<dt>{escape(k.replace('_', ' '))}</dt><dd>{_fact(v)}</dd>" for k, v in manifest.items())
-    keys = [key for key in QUANTITIES if any(math.isfinite(run.get(key, math.nan)) for run in results.runs)]
-    table = Table(
-        "All runs",
-        "",
-        [*_RUN, *map(heading, keys)],
-        [
-            [run["method"], *(_plain(run.get(name)) for name in _RUN), *(text(key, run.get(key)) for key in keys)]
-            for run in results.runs
-        ],
-    )
-    columns = [f"runs.csv, column {name}" for name in (*_RUN, *keys)]
-    cells = [["" for _ in _RUN] + [_plain(run.get(key)) for key in keys] for run in results.runs]
-    grid = _grid("runs", table.title, table, _Origins(_measurement(results), columns, cells=cells))
-    return f"<dl>{facts}</dl>{_titled(table, grid)}<h3>Configurations</h3>" + "".join(
-        f"<details><summary>{escape(label(method))}</summary>"
-        f"<pre>{escape(yaml.safe_dump(config, sort_keys=False))}</pre></details>"
-        for method, config in configs.items()
-    )
+# --- what the template calls ---
 
 
-def _fact(value: Any) -> str:
-    if isinstance(value, dict):
-        return escape(", ".join(f"{k} {v}" for k, v in value.items()))
-    return escape(", ".join(map(str, value)) if isinstance(value, list) else _plain(value))
+def _figures(directory: Path) -> dict[str, str]:
+    """Return the data URLs of the directory's figures by name."""
+    kinds = {".svg": "image/svg+xml", ".webp": "image/webp"}
+    paths = sorted(path for path in directory.iterdir() if path.suffix in kinds)
+    return {path.stem.replace("_", " "): data_url(path.read_bytes(), kinds[path.suffix]) for path in paths}
+
+
+def _marked_up(text: str) -> Markup:
+    """Return Markdown with strong text and code converted to HTML."""
+    code = re.sub(r"`(.*?)`", r"<code>\1</code>", escape(text))
+    return Markup(re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", code))
 
 
 def _plain(value: Any) -> str:
-    """Return a CSV cell's text; NaN stands for an empty cell."""
+    """Return a value of a CSV cell or of the manifest as text; NaN stands for an empty cell."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {item}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
     return "" if value is None or value != value else str(value)
