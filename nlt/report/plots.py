@@ -12,7 +12,7 @@ import torch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from nlt.metrics.display import display
+from nlt.display import display
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
