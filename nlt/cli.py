@@ -99,12 +99,8 @@ def _run(arguments: list[str]) -> int:
 
         selection = (options.methods, options.suites, options.manifest, options.views)
         stress(options.config, options.out, options.scale, options.data, *selection)
-    elif options.command == "report" and options.dashboard is None:
-        _draw(options.directory, options.megabytes)
     elif options.command == "report":
-        from nlt.report.dashboard import dashboard
-
-        dashboard(options.directory, options.dashboard)
+        _report(options)
     elif options.command == "scenes":
         _scenes(options)
     return 0
@@ -122,6 +118,15 @@ def _compare(options: argparse.Namespace) -> None:
     directory = compare(comparison, *run_options, options.train_images, lambda folder: write_tables(load(folder)))
     _draw(directory)
     print(f"\nwritten to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
+
+
+def _report(options: argparse.Namespace) -> None:
+    if options.dashboard is None:
+        _draw(options.directory, options.megabytes)
+    else:
+        from nlt.report.dashboard import dashboard
+
+        dashboard(options.directory, options.dashboard)
 
 
 def _draw(directory: str | Path, megabytes: int | None = None) -> None:

@@ -6,9 +6,7 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parents[1]
 # The build copies the configs into the package.
 CONFIGS = next(folder for folder in (Path(__file__).with_name("configs"), PROJECT / "configs") if folder.is_dir())
-
-
-# The descriptions that `nlt scenes add` writes, in the working directory; found by name beside the project's own.
+# The descriptions that `nlt scenes add` writes into the working directory, found by name like the project's own.
 OWN_SCENES = Path("scenes")
 
 

@@ -55,7 +55,7 @@ class LightTransportDataModule(L.LightningDataModule):
             )
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
         self.online, self.passes, self.train_images = online, 0, train_images
-        self.num_scenes, self.num_points = len(dataset.scenes), dataset.points  # training links them to the method
+        self.num_scenes = len(dataset.scenes)
         self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
         self.points: list[int] = []

@@ -19,6 +19,7 @@ class Judged(NamedTuple):
     radiance: Tensor  # (B, 3, H, W), with zeros in place of values that are not finite
     nonfinite: Tensor  # (B,) int64: pixels of each view that were not finite
     metrics: dict[str, Tensor]  # each (B,)
+    reference_features: dict[str, Tensor] | None  # as the callback of `evaluate` returned them
 
 
 @torch.inference_mode()
@@ -44,5 +45,6 @@ def evaluate(
         bad = ~prediction.isfinite()
         radiance = prediction.masked_fill(bad, 0)
         reference = (batch["reference_a"], batch["reference_b"], batch["exposure"])
-        values = metrics.update(radiance, *reference, of_reference=reference_features(number, batch))
-        yield Judged(batch, radiance, bad.any(1).sum((1, 2)), values)
+        features = reference_features(number, batch)
+        values = metrics.update(radiance, *reference, of_reference=features)
+        yield Judged(batch, radiance, bad.any(1).sum((1, 2)), values, features)

@@ -97,14 +97,12 @@ class Evaluation:
         shown, rows = [], []
         pools: list[tuple[Tensor, Tensor]] = []
         batches = self._batches(method.fields, method.spp if "traced" in method.fields else None)
-        for k, judged in enumerate(evaluate(method, batches, metrics, self._reference_features)):
+        for judged in evaluate(method, batches, metrics, self._reference_features):
             indices = judged.batch["index"].tolist()
             if judged.nonfinite.any():
                 raise DivergedError(f"a prediction is not finite in test samples {indices}")
-            if "pool" in judged.metrics:
-                features = self._reference_features(k, judged.batch)
-                assert features is not None
-                pools.append((judged.metrics.pop("pool"), features["pool"]))
+            if judged.reference_features:
+                pools.append((judged.metrics.pop("pool"), judged.reference_features["pool"]))
             columns = {name: values.tolist() for name, values in judged.metrics.items()}
             rows += [{"view": index, **{n: c[i] for n, c in columns.items()}} for i, index in enumerate(indices)]
             shown.append(judged.radiance[[i for i, index in enumerate(indices) if index in self.shown]].cpu())

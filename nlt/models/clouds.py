@@ -41,8 +41,8 @@ class CloudMethod(RenderingModule):
             photon_width: number of features of a photon; used by methods with a photon network.
             embedding_lr: factor on the learning rate of the point embeddings.
             embedding_decay: decoupled weight decay (Loshchilov and Hutter 2019) of the point embeddings.
-            num_scenes: scenes in the dataset; linked from the data.
-            num_points: points per scene; linked from the data.
+            num_scenes: scenes in the dataset; `nlt fit` sets it.
+            num_points: points per scene; `nlt fit` sets it.
             max_points: number of points that are used; None for all.
             max_photons: number of a sample's photons that are used, with their total flux kept; None for all.
         """

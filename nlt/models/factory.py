@@ -30,12 +30,12 @@ def method_class(config: Mapping[str, Any], place: object) -> type[Method]:
     return kind
 
 
-def without_unused(config: Mapping[str, Any], kind: type[Method] | None) -> dict[str, Any]:
+def without_unused(config: Mapping[str, Any], kind: type[Method]) -> dict[str, Any]:
     """Return a config without the settings of points and photons if a method of this class uses neither.
 
     Configs of a scale or variant are for all methods alike.
     """
-    if kind is None or issubclass(kind, CloudMethod):
+    if issubclass(kind, CloudMethod):
         return dict(config)
     unused = set(inspect.signature(CloudMethod).parameters) - set(inspect.signature(RenderingModule).parameters)
     model = dict(config.get("model", {}))

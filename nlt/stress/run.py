@@ -94,6 +94,7 @@ def stress(
     judged = [CLEAN, *(suite for suite in SUITES if suite in wanted and suite != TRAINING)]
     before = _measured(directory)
     rows = _stored_rows(directory, rendered.name, labels)
+    shown = set[str]()  # suites whose references have been written
     with tqdm(total=len(labels) * len(judged), unit="suite", file=sys.stderr, mininterval=1.0) as bar:
         for name in labels:
             bar.set_description(f"judging {name}")
@@ -109,7 +110,7 @@ def stress(
             method = accelerate(method, policy, device)
             for suite in judged:
                 label = {"method": name, "suites": rendered.name, "run": labels[name], "suite": suite}
-                _judge(directory, suite_views, method, label, rows, write_record)
+                _judge(directory, suite_views, method, label, rows, shown, write_record)
                 bar.update()
     write_rows(directory / ROWS, chain.from_iterable(rows.values()))
     if TRAINING in wanted:
@@ -138,7 +139,13 @@ def _stored_rows(directory: Path, suites: str, labels: Mapping[str, str]) -> Row
 
 
 def _judge(
-    directory: Path, views: SuiteViews, method: Method, label: dict[str, str], rows: Rows, write_record: Callable
+    directory: Path,
+    views: SuiteViews,
+    method: Method,
+    label: dict[str, str],
+    rows: Rows,
+    shown: set[str],
+    write_record: Callable,
 ) -> None:
     """Judge a method on a suite and write its rows and images, unless they are complete already."""
     name, suite = label["method"], label["suite"]
@@ -152,8 +159,9 @@ def _judge(
     rows[name, suite] = [label | row for row in judged]
     write_rows(directory / ROWS, chain.from_iterable(rows.values()))
     write_record()
-    if suite != FLICKER:
+    if suite not in (FLICKER, *shown):
         write_images(directory, f"{suite}-reference", **views.references(suite))
+        shown.add(suite)
     # Written last: it marks the suite as complete.
     write_images(directory, images.stem, **radiance, mark=np.array(mark), rows=np.array(len(judged)))
 

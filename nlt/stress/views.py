@@ -81,11 +81,13 @@ class SuiteViews:
         own = dict(hparams)  # to be restored after the denoisers are given another number of pixels
         for (owner, name), ladder in self.suites.ladders.items():
             if owner == suite and (method is None or _reads(method, ladder.change)):
-                for severity, value in enumerate(ladder.values, 1):
-                    if ladder.change == "pixels":
-                        hparams["one_in"] = value
-                    yield name, severity, [self._compute(batch, ladder.change, value) for batch in self.clean]
-                hparams.update(own)
+                try:
+                    for severity, value in enumerate(ladder.values, 1):
+                        if ladder.change == "pixels":
+                            hparams["one_in"] = value
+                        yield name, severity, [self._compute(batch, ladder.change, value) for batch in self.clean]
+                finally:
+                    hparams.update(own)
 
     def _compute(self, batch: Batch, change: str, value: float) -> Batch:
         if change in BUDGET:
