@@ -32,7 +32,7 @@ from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.report.figures import plt
 from nlt.scenes.assembly import Scene
-from nlt.scenes.description import EXPERIMENTS, TEACHERS, load_description
+from nlt.scenes.description import EXPERIMENTS, INTEGRATORS, load_description
 from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
@@ -78,14 +78,14 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
     description = load_description(name)
     scene = Scene(description, options.experiment)
     views = Views(scene)
-    renderers = {integrator: Renderer(scene, integrator) for integrator in TEACHERS}
+    renderers = {integrator: Renderer(scene, integrator) for integrator in INTEGRATORS}
     placed = []
     for view in range(options.views):
         rng = np.random.default_rng([options.seed, view])
         scene.set_state(sample_state(description, options.experiment, rng))
         placed.append((scene.state, views.sample(options.resolution, rng)))
-    images: dict[str, list[list[np.ndarray]]] = {integrator: [] for integrator in TEACHERS}
-    times: dict[str, list[float]] = {integrator: [] for integrator in TEACHERS}
+    images: dict[str, list[list[np.ndarray]]] = {integrator: [] for integrator in INTEGRATORS}
+    times: dict[str, list[float]] = {integrator: [] for integrator in INTEGRATORS}
     start, renders = time.perf_counter(), -1  # the first render is the warm-up
     while renders < LEAST or time.perf_counter() - start < options.seconds:
         if renders < 1:
@@ -94,7 +94,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
             rows.append([])
         for view, (state, camera) in enumerate(placed):
             scene.set_state(state)
-            for k, integrator in enumerate(TEACHERS):
+            for k, integrator in enumerate(INTEGRATORS):
                 seed = np.random.SeedSequence([options.seed, renders + 1, view, k]).generate_state(1)[0]
                 began = time.perf_counter()
                 images[integrator][-1].append(renderers[integrator].radiance(camera, SPP, int(seed)))
@@ -186,7 +186,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     ]
     for row in rows:
         cells = [f"{row['scene']} ({row['experiment'].replace('_', ' ')})"]
-        for integrator in TEACHERS:
+        for integrator in INTEGRATORS:
             unsure = " !" if row[f"{integrator}_worst_pixel"] > UNSURE else ""
             cells += [f"{1e6 * row[f'{integrator}_s']:.2f}", f"{row[f'{integrator}_variance']:.3g}{unsure}"]
         cells.append(f"{row['ratio']:.2f} ({row['ratio_low']:.2f} to {row['ratio_high']:.2f})")
@@ -204,7 +204,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
     for axis in axes.flat[len(rows) :]:
         axis.set_axis_off()
     for axis, row in zip(axes.flat, rows, strict=False):
-        for integrator, marker in zip(TEACHERS, "os", strict=True):
+        for integrator, marker in zip(INTEGRATORS, "os", strict=True):
             x, y = row[f"{integrator}_s"] * spp * 1e6, row[f"{integrator}_variance"] / spp
             axis.plot(x, y, f"{marker}-", color=COLOURS[integrator], label=integrator)
             axis.annotate("1 spp", (x[0], y[0]), (5, 4), textcoords="offset points", fontsize=7, color="0.3")

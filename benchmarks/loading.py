@@ -69,7 +69,8 @@ def synthetic(spec: DatasetSpec, root: str) -> Path:
 def build(method: str, spec: DatasetSpec, width: int) -> Method:
     """Return a method with random weights."""
     file = find_config("model", method)
-    return factory.build(read_configs([file]), file, width=width, num_scenes=len(spec.scenes), num_points=spec.points)
+    sizes = {"width": width, "num_scenes": len(spec.scenes), "num_points": spec.num_points}
+    return factory.build(read_configs([file]), file, **sizes)
 
 
 class Bare(Dataset):

@@ -274,7 +274,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--methods", nargs="+", help="configs in configs/model (default: all)")
     parser.add_argument(
         "--set", dest="changed", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
-        help="override resolution, points, photons, width, depth, batch_size, workers or batch (frames at a time)",
+        help="override resolution, num_points, num_photons, width, depth, batch_size, workers or batch (frames)",
     )  # fmt: skip
     parser.add_argument(
         "--ckpt", dest="checkpoint", metavar="CKPT", help="checkpoint of the only method (default: random weights)"
@@ -283,7 +283,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
     parser.add_argument(
         "--growth", nargs="*", metavar="METHOD",
-        help="also vary resolution, points, photons, width and batch (without METHOD: of nlt_photons)",
+        help="also vary resolution, num_points, num_photons, width and batch (without METHOD: of nlt_photons)",
     )  # fmt: skip
     parser.add_argument("--out", default="results/bench", help="directory for the results (default: results/bench)")
 

@@ -97,7 +97,7 @@ class NLTCLI(LightningCLI):
         if issubclass(method_class(config.as_dict(), "--config"), CloudMethod):
             dataset = config.data.dataset
             config.model.init_args.num_scenes = len(dataset.scenes)
-            config.model.init_args.num_points = dataset.points
+            config.model.init_args.num_points = dataset.num_points
 
     def _parse_ckpt_path(self) -> None:
         """Check the checkpoint; Lightning's version would silently replace the config's model by the checkpoint's."""

@@ -3,7 +3,7 @@
 from nlt.data.spec import DatasetSpec
 
 SIZE = {
-    "resolution": 16, "train": 12, "val": 4, "test": 4, "points": 200, "photons": 200, "reference_spp": 2,
+    "resolution": 16, "train": 12, "val": 4, "test": 4, "num_points": 200, "num_photons": 200, "reference_spp": 2,
     "shard_size": 4,
 }  # fmt: skip
 

@@ -111,7 +111,7 @@ def make_troubled_results(directory):
     runs = [lost if (run["method"], run["seed"]) == ("nlt", 1) else run for run in results.runs]
     write_rows(directory / RUNS, [*({**run, "run": f"runs/{run['method']}-{run['seed']}"} for run in runs), *bad])
     origin = {"command": "nlt compare --config made_up", "commit": 20 * "ab", "device": "CPU, made up"}
-    origin |= {"teachers": {"egg": "bdpt", "kitchen": "path"}}
+    origin |= {"integrators": {"egg": "bdpt", "kitchen": "path"}}
     configs = {method: {"model": {"init_args": {"width": 8}}} for method in TROUBLED}
     write_manifest(directory, {**results.manifest, **origin, "versions": {"torch": "2.0"}, "configs": configs})
     return load(directory)

@@ -45,7 +45,7 @@ def test_papers_experiments(experiment, kind):
     files = [f"data/{kind}_{experiment}", f"scale/{scale}"]
     spec, config = load_spec(files)[0], read_configs(files)
     assert (len(spec.scenes), spec.experiment) == (count, change)
-    assert (spec.train, spec.test, spec.points, spec.photons) == (100_000, 2048, 10_000, 10_000)
+    assert (spec.train, spec.test, spec.num_points, spec.num_photons) == (100_000, 2048, 10_000, 10_000)
     assert (spec.noisy_spp, spec.input_spp, 2 * spec.reference_spp) == (1, 4, 128)
     sizes = spec.resolution, config["trainer"]["max_steps"], config["data"]["batch_size"]
     assert sizes == (resolution, iterations, batch)

@@ -87,7 +87,8 @@ def sandbox(tmp_path_factory):
             if path := re.match(r"# (\S+/\S+)\n", text):
                 (folder / path[1]).parent.mkdir(parents=True, exist_ok=True)
                 write(folder / path[1], text)
-    dataset = {"resolution": 16, "train": 2, "val": 1, "test": 1, "points": 64, "photons": 64, "reference_spp": 1}
+    counts = {"num_points": 64, "num_photons": 64}
+    dataset = {"resolution": 16, "train": 2, "val": 1, "test": 1, "reference_spp": 1, **counts}
     write(folder / "small.yaml", {"data": {"dataset": dataset}})
     trainer = {**TRAINER, "max_epochs": 2, "default_root_dir": "fitted"}
     write(

@@ -15,7 +15,7 @@ from nlt.metrics.inception import STAGES
 
 DATASET = {
     "scenes": ["living_room"], "experiment": "moving_lights", "resolution": 16, "train": 8, "val": 3, "test": 3,
-    "points": 64, "photons": 64, "reference_spp": 2, "shard_size": 4,
+    "num_points": 64, "num_photons": 64, "reference_spp": 2, "shard_size": 4,
 }  # fmt: skip
 TRAINER = {
     "max_epochs": 1, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False, "enable_model_summary": False,

@@ -51,10 +51,10 @@ class Bare:
 
     def photons(self, seed: int) -> None:
         """Trace as many photons as the spec has."""
-        count = self.spec.photons if dr.is_jit_v(mi.Float) else 1
+        count = self.spec.num_photons if dr.is_jit_v(mi.Float) else 1
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed, count)
-        for _ in range(self.spec.photons // count):
+        for _ in range(self.spec.num_photons // count):
             for value in self._cast(self.scene.mi_scene, sampler):
                 np.array(value)
 

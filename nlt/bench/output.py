@@ -143,7 +143,8 @@ def _ceilings(ceilings: Row, settings: Row) -> list[str]:
     names = {"path_tracing": "at 1 spp", "gbuffer": "of depth, normal and albedo", "photons": ""}
     size = settings["resolution"]
     for name, seconds in ceilings["bare_s"].items():
-        title = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else f"{settings['photons']:,} photons, bare"
+        bare = f"{settings['num_photons']:,} photons, bare"
+        title = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else bare
         table.append([title, f"{1e3 * seconds:.2f} ms"])
     return ["## This machine's ceilings, in the same run", "", *grid(["", "best"], table)]
 

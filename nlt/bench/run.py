@@ -49,12 +49,12 @@ from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
 from nlt.training import quiet, trainer_defaults
 
-_DATASET, _MODEL = ("resolution", "points", "photons"), ("width", "depth")
+_DATASET, _MODEL = ("resolution", "num_points", "num_photons"), ("width", "depth")
 # The factors over which the growth of costs is measured, one at a time around the settings.
 GRID: dict[str, Sequence[int]] = {
     "resolution": (64, 128, 256, 512, 1024),
-    "points": (1_000, 3_000, 10_000, 30_000, 100_000),
-    "photons": (1_000, 3_000, 10_000, 30_000, 100_000),
+    "num_points": (1_000, 3_000, 10_000, 30_000, 100_000),
+    "num_photons": (1_000, 3_000, 10_000, 30_000, 100_000),
     "width": (8, 16, 32, 64, 128),
     "batch": (1, 2, 4, 8, 16),
 }
@@ -70,8 +70,8 @@ class Sizes(Settings):
     """The settings of the dataset, the model and the training; `batch` is the number of frames rendered at once."""
 
     resolution: int = Field(ge=8)
-    points: PositiveInt
-    photons: PositiveInt
+    num_points: PositiveInt
+    num_photons: PositiveInt
     width: PositiveInt = 64
     depth: NonNegativeInt = 3
     batch_size: PositiveInt = 32
@@ -243,7 +243,7 @@ class Benchmark:
         config = read_configs([self.files[0], str(file), self.files[1]])
         torch.manual_seed(0)
         arguments = {key: settings[key] for key in _MODEL} | {"num_scenes": len(self.spec.scenes)}
-        return build(config, file, **arguments, num_points=settings["points"])
+        return build(config, file, **arguments, num_points=settings["num_points"])
 
     def _loaded(self, name: str) -> RenderingModule:
         method = load_method(str(self.checkpoint), "--ckpt", self.device)
@@ -251,7 +251,7 @@ class Benchmark:
         wanted = method_class(read_configs([file]), file)
         if type(method) is not wanted:
             raise UserError(f"--ckpt: {self.checkpoint}: is of {type(method).__name__}, not {wanted.__name__}")
-        points = self.settings["points"]
+        points = self.settings["num_points"]
         points = min(points, method.hparams.get("max_points") or points)
         for key, here in (("num_points", points), ("num_scenes", len(self.spec.scenes))):
             if key in method.architecture and method.hparams[key] != here:
@@ -436,8 +436,8 @@ def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:
 
 
 def _affects(factor: str, method: Method) -> bool:
-    if factor in ("points", "photons"):
-        return any(name.startswith(factor[:-1]) for name in method.fields)
+    if factor in ("num_points", "num_photons"):
+        return any(name.startswith(factor.removeprefix("num_")[:-1]) for name in method.fields)
     return factor != "width" or isinstance(method, RenderingModule)
 
 

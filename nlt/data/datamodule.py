@@ -58,7 +58,7 @@ class LightTransportDataModule(L.LightningDataModule):
         self.num_scenes = len(dataset.scenes)
         self.stored = dataset.without_train() if online else dataset
         self.directory: AnyPath | None = None
-        self.points: list[int] = []
+        self.point_checksums: list[int] = []
 
     def next_pass(self) -> int:
         """Return the index of the next pass over the online samples and count it."""
@@ -71,7 +71,7 @@ class LightTransportDataModule(L.LightningDataModule):
         `points` has a CRC of each scene's points, to which embeddings belong. `passes` is the number of passes over
         online samples that were started; a resumed run continues after them.
         """
-        return {"points": self.points, "passes": self.passes}
+        return {"point_checksums": self.point_checksums, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state of a checkpoint.
@@ -80,8 +80,9 @@ class LightTransportDataModule(L.LightningDataModule):
             UserError: the method's embeddings belong to other points than the dataset's.
         """
         self.passes = state_dict.get("passes", 0)
-        points, method = state_dict.get("points"), getattr(self.trainer, "lightning_module", None)
-        if getattr(method, "has_point_embeddings", False) and points and self.points and points != self.points:
+        theirs, ours = state_dict.get("point_checksums"), self.point_checksums
+        method = getattr(self.trainer, "lightning_module", None)
+        if getattr(method, "has_point_embeddings", False) and theirs and ours and theirs != ours:
             raise UserError(
                 f"{self.directory}: its points differ from those of the checkpoint's embeddings, for example because "
                 "another NLT_VARIANT rendered it; give --data.root with the checkpoint's own dataset, or train again"
@@ -97,7 +98,7 @@ class LightTransportDataModule(L.LightningDataModule):
             directory = self.stored.directory(self.root)
             check_dataset(directory, self.stored)
             self.directory = directory
-            self.points = [points_crc(read_points(directory / points_name(k))) for k in range(self.num_scenes)]
+            self.point_checksums = [points_crc(read_points(directory / points_name(k))) for k in range(self.num_scenes)]
 
     def split(self, name: str) -> LightTransportDataset:
         """Return the dataset of a split with the fields that the trainer's method needs, or all without a trainer."""

@@ -34,11 +34,11 @@ PILOT_VIEWS, PILOT_SPP = 4, 32
 
 @dataclass(frozen=True)
 class Job:
-    """The work of one process: shards of a scene and, if `points`, the scene's points."""
+    """The work of one process: shards of a scene and, if `needs_points`, the scene's points."""
 
     scene: int
     shards: tuple[Shard, ...]
-    points: bool
+    needs_points: bool
 
 
 def generate(
@@ -163,11 +163,12 @@ def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
     most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))  # shards of a job
     for scene in range(len(spec.scenes)):
         in_scene = [shard for shard in shards if shard.scene == scene]
-        points = points_name(scene) in missing
+        needs_points = points_name(scene) in missing
         # Shards of evaluated splits cost more, so they are spread over the jobs.
         count = -(-len(in_scene) // most)
         parts = [in_scene[k::count] for k in range(count)] or [[]]
-        jobs += [Job(scene, tuple(part), points and k == 0) for k, part in enumerate(parts) if part or points]
+        nonempty = [(k, tuple(part)) for k, part in enumerate(parts) if part or needs_points]
+        jobs += [Job(scene, part, needs_points and k == 0) for k, part in nonempty]
     return jobs
 
 
@@ -198,7 +199,7 @@ def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int,
 
 def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:
     """Render and write the files of a job; `tick(n)` is called after every n samples."""
-    if job.points:
+    if job.needs_points:
         write_shard(directory / points_name(job.scene), [render.points()])
     for shard in job.shards:
         path = directory / shard.name

@@ -36,7 +36,7 @@ class SampleRenderer:
         self.spec, self.index = spec, scene
         self.description = spec.descriptions[scene]
         self.scene = build(self.description, spec.experiment)
-        self.renderer = Renderer(self.scene, spec.teacher)
+        self.renderer = Renderer(self.scene, spec.integrator)
         self.views = Views(self.scene)
         self._taken: dict[str, set[bytes]] = {}  # keys of the states that each split avoids
         if threads:
@@ -44,7 +44,7 @@ class SampleRenderer:
 
     def points(self) -> dict[str, np.ndarray]:
         """Return the scene's point cloud."""
-        points = sample_points(self.scene, self.spec.points, self.spec.seed)
+        points = sample_points(self.scene, self.spec.num_points, self.spec.seed)
         share = float(points["area_share"])
         print(f"{self.description.name}: points lie on the {share:.1%} of the surface that can be seen", flush=True)
         return points
@@ -90,7 +90,7 @@ class SampleRenderer:
         if not fields.keys().isdisjoint(("depth", "normal", "albedo", "emission")):
             sample |= self.renderer.gbuffer(camera)
         if any(name.startswith("photon_") for name in fields):
-            sample |= self.renderer.photons(spec.photons, photons)
+            sample |= self.renderer.photons(spec.num_photons, photons)
         return {
             name: np.ascontiguousarray(sample[name], field.dtype).reshape(field.resolve(sizes))
             for name, field in fields.items()

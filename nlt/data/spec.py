@@ -18,7 +18,7 @@ from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath, open_path
 from nlt.data.sample import FIELDS, SPLITS, Field
 from nlt.errors import UserError
-from nlt.scenes.description import Experiment, SceneDescription, Teacher, load_description
+from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 3  # version of the files on disk
@@ -42,8 +42,8 @@ class DatasetSpec:
         train: training samples per scene; with online training, per scene and epoch.
         val: validation samples per scene.
         test: test samples per scene.
-        points: surface points per scene.
-        photons: photons per sample.
+        num_points: surface points per scene.
+        num_photons: photons per sample.
         noisy_spp: samples per pixel of the training target.
         input_spp: samples per pixel of the denoisers' input.
         reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the maximum.
@@ -51,7 +51,7 @@ class DatasetSpec:
             of each scene determine the samples per pixel that reach it. With 0, `reference_spp` is used.
         seed: seed of everything random in the dataset.
         shard_size: samples per file.
-        teacher: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
+        integrator: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
 
     Raises:
         UserError: a value has the wrong type or is out of bounds.
@@ -63,15 +63,15 @@ class DatasetSpec:
     train: NonNegativeInt = 1000
     val: NonNegativeInt = 16
     test: NonNegativeInt = 64
-    points: PositiveInt = 10_000
-    photons: PositiveInt = 10_000
+    num_points: PositiveInt = 10_000
+    num_photons: PositiveInt = 10_000
     noisy_spp: PositiveInt = 1
     input_spp: PositiveInt = 4
     reference_spp: PositiveInt = 64
     reference_mse: Annotated[float, Bound(ge=0, allow_inf_nan=False)] = 0.0
     seed: NonNegativeInt = 0
     shard_size: PositiveInt = 64
-    teacher: Literal["scene", Teacher] = "scene"
+    integrator: Literal["scene", Integrator] = "scene"
 
     __pydantic_config__ = Settings.model_config  # in a config file, unknown keys are refused and nothing is converted
 
@@ -88,7 +88,7 @@ class DatasetSpec:
     def sizes(self) -> dict[str, int]:
         """The sizes that the symbols in the shapes of `FIELDS` stand for."""
         most = max(len(d.movables(self.experiment)) for d in self.descriptions)
-        return {"H": self.resolution, "W": self.resolution, "P": self.photons, "N": self.points, "M": most}
+        return {"H": self.resolution, "W": self.resolution, "P": self.num_photons, "N": self.num_points, "M": most}
 
     def fields(self, split: str) -> dict[str, Field]:
         """Return the fields that a sample of this split stores."""

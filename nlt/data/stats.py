@@ -139,7 +139,7 @@ def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str,
     lap("noisy", lambda: trace.radiance(camera, spec.noisy_spp, k))
     lap("noisy_input", lambda: trace.radiance(camera, spec.input_spp, k))
     lap("G-buffer", lambda: trace.gbuffer(camera))
-    lap("photons", lambda: trace.photons(spec.photons, k))
+    lap("photons", lambda: trace.photons(spec.num_photons, k))
     lap("reference", lambda: trace.radiance(camera, timed_spp(spec), k))
     lap("storing", store)
     return seconds

@@ -87,7 +87,8 @@ class Clock:
             if "gbuffer" in method.stages:
                 self._timed(seconds, "gbuffer", partial(renderer.gbuffer, camera))
             if "photons" in method.stages:
-                self._timed(seconds, "photons", partial(renderer.photons, method.num_photons or spec.photons, index))
+                count = method.num_photons or spec.num_photons
+                self._timed(seconds, "photons", partial(renderer.photons, count, index))
             if "path_tracing" in method.stages:
                 pixels = None if method.pixel_fraction == 1 else mask[row, 0].flatten().nonzero()[:, 0].cpu().numpy()
                 spp = method.spp or spec.input_spp

@@ -65,14 +65,14 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
     write_bytes(Path(output), file.getvalue())
 
 
-def save_trained(method: RenderingModule, spec: DatasetSpec, points: list[int], output: str) -> None:
+def save_trained(method: RenderingModule, spec: DatasetSpec, point_checksums: list[int], output: str) -> None:
     """Write a method, its dataset's spec and its points' checksums as safetensors for `load_trained`."""
     settings = {key: value for key, value in method.hparams.items() if not key.startswith("_")}
     metadata = {
         "method": method.class_path(),
         "init_args": settings,
         "dataset": dataclasses.asdict(spec),
-        "points": points,
+        "point_checksums": point_checksums,
     }
     weights = {name: tensor.contiguous() for name, tensor in method.state_dict().items()}
     write_bytes(Path(output), save(weights, {"nlt": json.dumps(metadata)}))
@@ -97,7 +97,8 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
             spec = DatasetSpec(**read_configs([str(config)])["data"]["dataset"])
         except (LookupError, TypeError):
             raise UserError(f"CKPT: {path}: {config} names no dataset; keep the checkpoint in its run") from None
-        return method, spec, read_checkpoint(path).get(LightTransportDataModule.__qualname__, {}).get("points", [])
+        data = read_checkpoint(path).get(LightTransportDataModule.__qualname__, {})
+        return method, spec, data.get("point_checksums", [])
     try:
         with safe_open(path, "pt") as file:
             metadata = json.loads(file.metadata()["nlt"])
@@ -105,7 +106,7 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
         loaded = build({"model": {"class_path": metadata["method"], "init_args": metadata["init_args"]}}, "CKPT")
         assert isinstance(loaded, RenderingModule)
         loaded.load_state_dict(weights)
-        return loaded, DatasetSpec(**metadata["dataset"]), metadata.get("points", [])
+        return loaded, DatasetSpec(**metadata["dataset"]), metadata.get("point_checksums", [])
     except OSError as error:
         raise UserError(f"CKPT: {path}: cannot be read: {error.strerror or error}") from None
     except (SafetensorError, LookupError, TypeError, UserError, ValueError, RuntimeError, AssertionError):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
-from nlt.rendering.renderer import Renderer, choose_teacher
+from nlt.rendering.renderer import Renderer, choose_integrator
 from nlt.rendering.variant import use_variant
 from nlt.scenes.camera import Camera
 
@@ -26,11 +26,11 @@ class Frames:
         self._renderer = renderer or cache(lambda scene: SampleRenderer(dataset.spec, scene))
         self.traced = cache(self._traced)
 
-    def teachers(self) -> dict[str, str]:
+    def integrators(self) -> dict[str, str]:
         """Return the integrator that traces radiance on this machine, by scene."""
         use_variant()
         spec = self.dataset.spec
-        return {scene.name: choose_teacher(scene.teacher, spec.teacher) for scene in spec.descriptions}
+        return {scene.name: choose_integrator(scene.integrator, spec.integrator) for scene in spec.descriptions}
 
     def place(self, index: int) -> tuple[Renderer, Camera]:
         """Set a sample's scene to its state; return its renderer and its camera."""

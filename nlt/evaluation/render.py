@@ -149,9 +149,9 @@ def render(
     if not video and Path(output).suffix:
         raise UserError(f"-o: must be NAME.mp4 or a folder for PNGs, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
-    method, spec, points = load_trained(checkpoint)
+    method, spec, checksums = load_trained(checkpoint)
     spec, index = _with_scene(method, spec, scene, checkpoint)
-    spec = dataclasses.replace(spec, photons=photons or spec.photons)
+    spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
     description = spec.descriptions[index]
     views = cameras(description, camera_path, frames, *resolution)
     scene_states = states(description, spec.experiment, state, light, frames)
@@ -169,7 +169,7 @@ def render(
         device = default_device()
         policy = Policy.for_device(device)
         model = ModelRenderer(accelerate(method, policy, device), spec, index, device)
-        if method.has_point_embeddings and points and points_crc(model.points) != points[index]:
+        if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[index]:
             raise UserError(
                 f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
                 f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
@@ -201,7 +201,7 @@ def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoi
     files = [find_config("scenes", name).resolve() for name in spec.scenes]
     file = find_config("scenes", scene).resolve()
     if method.has_point_embeddings:
-        points = min(spec.points, method.hparams["max_points"] or spec.points)
+        points = min(spec.num_points, method.hparams["max_points"] or spec.num_points)
         if (method.hparams["num_scenes"], method.hparams["num_points"]) != (len(files), points):
             raise UserError(
                 f"CKPT: {checkpoint}: has embeddings of {method.hparams['num_scenes']} scenes with "

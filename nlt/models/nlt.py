@@ -19,52 +19,53 @@ PHOTON_ATTRIBUTES = 3 + 3 + 3  # origin, direction, colour
 
 
 class NeuralLightTransport(CloudMethod):
-    """Sec. "Method": the U-Net sees the G-buffer, projected point features and, with `photons`, photon features."""
+    """Sec. "Method": the U-Net sees the G-buffer, projected point features and, with `use_photons`, photon features."""
 
     architecture = (
-        *CloudMethod.architecture, "num_scenes", "num_points", "points", "photons", "embedding",
+        *CloudMethod.architecture, "num_scenes", "num_points", "use_points", "use_photons", "embedding",
         "point_width", "photon_width",
     )  # fmt: skip
 
-    def __init__(self, points: bool = True, photons: bool = False, embedding: int = 32, **kwargs: Any) -> None:
+    def __init__(self, use_points: bool = True, use_photons: bool = False, embedding: int = 32, **kwargs: Any) -> None:
         """The keyword arguments are those of the base class.
 
         Args:
-            points: use the points; without them there is no PointNet and no embedding.
-            photons: use the photons ("w/ Photons").
+            use_points: use the points; without them there is no PointNet and no embedding.
+            use_photons: use the photons ("w/ Photons").
             embedding: channels of the learned embedding of each point.
         """
         super().__init__(**kwargs)
         hparams = self.hparams
-        if points:
+        if use_points:
             self.embedding = PointEmbedding(hparams["num_scenes"], hparams["num_points"], embedding)
             self.pointnet = PointNet(embedding + POINT_ATTRIBUTES, hparams["point_width"])
-        if photons:
+        if use_photons:
             self.photon_network = PhotonNetwork(PHOTON_ATTRIBUTES, hparams["photon_width"])
 
     @property
     def feature_channels(self) -> int:
         chosen = self.hparams
-        return GBUFFER_CHANNELS + chosen["point_width"] * chosen["points"] + chosen["photon_width"] * chosen["photons"]
+        points = chosen["point_width"] * chosen["use_points"]
+        return GBUFFER_CHANNELS + points + chosen["photon_width"] * chosen["use_photons"]
 
     @property
     def inputs(self) -> tuple[str, ...]:
         points = tuple(f"point_{name}" for name in ("position", "visible", "material", "albedo", "emission"))
         photons = tuple(f"photon_{name}" for name in ("origin", "direction", "flux", "hit", "valid"))
-        used = (points if self.hparams["points"] else ()) + (photons if self.hparams["photons"] else ())
+        used = (points if self.hparams["use_points"] else ()) + (photons if self.hparams["use_photons"] else ())
         return tuple(dict.fromkeys((*GBUFFER, *PROJECTION, *used)))
 
     @property
     def stages(self) -> tuple[str, ...]:
-        return ("gbuffer", "photons") if self.hparams["photons"] else ("gbuffer",)
+        return ("gbuffer", "photons") if self.hparams["use_photons"] else ("gbuffer",)
 
     def transport(self, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
         """Return features of the points (B, N, point_width) and photons (B, P, photon_width), None if not used.
 
         In training, `features` computes the photons' features, because it knows which photons the view sees.
         """
-        points = self._point_features(batch) if self.hparams["points"] else None
-        all_photons = self.hparams["photons"] and not (self.training and torch.is_grad_enabled())
+        points = self._point_features(batch) if self.hparams["use_points"] else None
+        all_photons = self.hparams["use_photons"] and not (self.training and torch.is_grad_enabled())
         return points, self.photon_network(self._photons(batch)) if all_photons else None
 
     def _point_features(self, batch: Batch) -> Tensor:
@@ -93,7 +94,7 @@ class NeuralLightTransport(CloudMethod):
             clouds.append((points, batch["point_position"], batch["point_visible"]))
         if photons is not None:
             clouds.append((photons, batch["photon_hit"], batch["photon_valid"]))
-        delayed = self.hparams["photons"] and photons is None
+        delayed = self.hparams["use_photons"] and photons is None
         return self.gbuffer_and(batch, clouds, [self._seen_photons(batch)] if delayed else ())
 
     def _seen_photons(self, batch: Batch) -> Tensor:

@@ -34,23 +34,23 @@ class Renderer:
     """Traces rays through a scene in its current state (`scene.set_state`).
 
     Args:
-        teacher: "path" or "bdpt", the integrator that estimates radiance; "scene" stands for the one in scene.yaml, if
-            the active Mitsuba variant can run it. Both have the same expectation.
+        integrator: "path" or "bdpt", which estimates radiance; "scene" stands for the one in scene.yaml, if the active
+            Mitsuba variant can run it. Both have the same expectation.
 
     Raises:
-        UserError: the active variant cannot run `teacher`.
+        UserError: the active variant cannot run `integrator`.
     """
 
-    def __init__(self, scene: Scene, teacher: str = "scene") -> None:
+    def __init__(self, scene: Scene, integrator: str = "scene") -> None:
         self.scene = scene
-        self.teacher = choose_teacher(scene.description.teacher, teacher)
+        self.integrator_name = choose_integrator(scene.description.integrator, integrator)
         # Infinite depth with Russian roulette, because a maximum depth would bias the result.
         self.integrator = mi.load_dict(
-            {"type": "path", "max_depth": -1} if self.teacher == "path" else {"type": "bdpt"}
+            {"type": "path", "max_depth": -1} if self.integrator_name == "path" else {"type": "bdpt"}
         )
         self.emitters = list(scene.mi_scene.emitters())
         self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
-        self._radiance = freeze(_radiance if self.teacher == "path" else _bidirectional)
+        self._radiance = freeze(_radiance if self.integrator_name == "path" else _bidirectional)
         self._gbuffer = freeze(_gbuffer)
         self._emission = freeze(_emission)
         self._transmits = freeze(_transmits)
@@ -85,7 +85,7 @@ class Renderer:
         total = np.zeros((len(pixels), 3))
         batch = max(1, min(spp, _MAX_LANES // max(len(pixels), 1)))
         fixed = self._camera_values(camera)
-        if self.teacher == "bdpt":
+        if self.integrator_name == "bdpt":
             fixed["image"] = mi.Vector3f(camera.width, camera.height, len(pixels))
             dr.make_opaque(fixed["image"])
         for k, start in enumerate(range(0, spp, batch)):
@@ -329,7 +329,7 @@ def _photons(scene: Any, masks: bool, emitter: Any, low: Any, high: Any, u0: Any
     return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid() & crosses
 
 
-def choose_teacher(own: str, wanted: str = "scene") -> str:
+def choose_integrator(own: str, wanted: str = "scene") -> str:
     """Return the integrator, "path" or "bdpt", for a scene whose description names `own`.
 
     Args:
@@ -338,17 +338,17 @@ def choose_teacher(own: str, wanted: str = "scene") -> str:
     Raises:
         UserError: `wanted` is "bdpt" and the active variant cannot run it.
     """
-    teacher = own if wanted == "scene" else wanted
-    if teacher == "path":
-        return teacher
+    integrator = own if wanted == "scene" else wanted
+    if integrator == "path":
+        return integrator
     if is_jit():
         # Imported here because its classes belong to the active variant.
         import nlt.rendering.bdpt  # noqa: F401
 
-        return teacher
+        return integrator
     if wanted != "scene":
-        raise UserError("teacher: bdpt needs Mitsuba's llvm or cuda variant; install LLVM, or use teacher: path")
-    log.warning("teacher: bdpt needs Mitsuba's llvm or cuda variant; using path, which has the same expectation")
+        raise UserError("integrator: bdpt needs Mitsuba's llvm or cuda variant; install LLVM, or use integrator: path")
+    log.warning("integrator: bdpt needs Mitsuba's llvm or cuda variant; using path, which has the same expectation")
     return "path"
 
 

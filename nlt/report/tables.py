@@ -77,7 +77,7 @@ def _note(results: Results) -> str:
             "perfect image would still differ from it by a quarter of this MSE. A value marked ≈ is closer to the best "
             "of its column than the last row is to a perfect value, so the reference cannot tell the two apart."
         )
-    integrators = [f"{name} in {scene}" for scene, name in manifest.get("teachers", {}).items() if name != "path"]
+    integrators = [f"{name} in {scene}" for scene, name in manifest.get("integrators", {}).items() if name != "path"]
     if integrators:
         listed = ", ".join(integrators)
         notes.append(f"Path-traced rows and the inputs of OIDN and denoising are rendered with {listed}.")

@@ -11,7 +11,7 @@ from nlt.scenes.description import load_description
 
 def listing() -> str:
     """Return a table with one line per description; the line of a broken description holds its error."""
-    rows = [("scene", "source", "objects", "moving light", "teacher")]
+    rows = [("scene", "source", "objects", "moving light", "integrator")]
     broken = []
     for name in config_names("scenes"):
         try:
@@ -20,7 +20,7 @@ def listing() -> str:
             broken.append(f"{name}  broken: {error}")
             continue
         location = "built in" if scene.path is None else "here" if Path(scene.path).is_file() else "not here"
-        rows.append((name, location, str(len(scene.objects)), "yes" if scene.light else "no", scene.teacher))
+        rows.append((name, location, str(len(scene.objects)), "yes" if scene.light else "no", scene.integrator))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines + broken)

@@ -33,7 +33,7 @@ def show(name: str) -> str:
         f"source: {description.source}, {description.units_per_metre:g} units per metre",
         f"camera: {_span(description.camera)} m, field of view {description.fov:g} degrees",
         f"room: {'not given' if description.room is None else _span(description.room) + ' m'}",
-        f"exposure: {description.exposure:g}; teacher: {description.teacher}",
+        f"exposure: {description.exposure:g}; integrator: {description.integrator}",
     ]
     if description.light is not None:
         size, box = description.light.size, description.light.box

@@ -22,8 +22,8 @@ from nlt.scenes import mitsuba_xml
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
-Teacher = Literal["path", "bdpt"]
-TEACHERS: tuple[str, ...] = get_args(Teacher)  # integrators that render the images to learn from
+Integrator = Literal["path", "bdpt"]
+INTEGRATORS: tuple[str, ...] = get_args(Integrator)  # integrators that render the images to learn from
 # Material types of surfaces, by the lobes of their BSDFs. Datasets store the index into this tuple.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
 MOVING_LIGHT = "moving_light"  # the light's name as a movable object, and its shape id
@@ -64,7 +64,7 @@ class SceneDescription:
 
     `camera` and `look_at` are (2, 3) boxes (supp., View Sampling). If the file has no `look_at`, it is half as large as
     `camera` and has the same centre. `room` (2, 3) bounds the inside of the room; None stands for the whole scene.
-    `teacher` is the integrator with the lower variance at equal time in this scene.
+    `integrator` is the integrator with the lower variance at equal time in this scene.
     """
 
     name: str
@@ -79,7 +79,7 @@ class SceneDescription:
     objects: tuple[Movable, ...]
     light: MovingLight | None
     room: np.ndarray | None = None
-    teacher: str = "path"
+    integrator: str = "path"
 
     def movables(self, experiment: str) -> tuple[Movable, ...]:
         """Return the objects that a state of this experiment moves: none, all objects, or all objects and the light.
@@ -177,7 +177,7 @@ class _File(Settings):
     camera: _Corners
     look_at: _Corners | None = None
     room: _Box | None = None
-    teacher: Teacher = "path"
+    integrator: Integrator = "path"
     objects: dict[str, _Object] = Field(default={})
     moving_light: _Light | None = None
 
@@ -220,7 +220,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
         objects=tuple(Movable(key, entry.shapes, metres(entry.box)) for key, entry in read.objects.items()),
         light=light,
         room=None if read.room is None else metres(read.room),
-        teacher=read.teacher,
+        integrator=read.integrator,
     )
 
 

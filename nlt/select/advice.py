@@ -37,16 +37,16 @@ class Facts:
         moving: names of the objects that states move or remove.
         moving_lights: names of those among them that emit light.
         materials: share of each of `MATERIALS` in the visible surface, where it is above zero.
-        points: by N, the share of the pixels with a surface in which at least one of N points is visible.
-        photons: the same by P, for P photons.
+        point_coverage: by N, the share of the pixels with a surface in which at least one of N points is visible.
+        photon_coverage: the same by P, for P photons.
     """
 
     scene: str
     moving: tuple[str, ...]
     moving_lights: tuple[str, ...]
     materials: dict[str, float]
-    points: dict[int, float]
-    photons: dict[int, float]
+    point_coverage: dict[int, float]
+    photon_coverage: dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def measure_facts(spec: DatasetSpec) -> list[Facts]:
         UserError: a scene does not load.
     """
     choose_variant()  # chosen once; the processes inherit it
-    spec = dataclasses.replace(spec, points=_MOST, photons=_MOST, train=0, val=0, test=_VIEWS)
+    spec = dataclasses.replace(spec, num_points=_MOST, num_photons=_MOST, train=0, val=0, test=_VIEWS)
     return [Process(_facts, spec, scene).result() for scene in range(len(spec.scenes))]
 
 
@@ -75,13 +75,13 @@ def _facts(spec: DatasetSpec, scene: int) -> Facts:
     render = SampleRenderer(spec, scene)
     moving, lights = what_moves(render.scene)
     points = render.points()
-    curves: dict[str, list[dict[int, float]]] = {"points": [], "photons": []}
+    curves: dict[str, list[dict[int, float]]] = {"point_coverage": [], "photon_coverage": []}
     for view in range(spec.test):
         sample = render.sample("test", view, only=_FIELDS)
         camera: dict[str, Any] = {name: torch.from_numpy(sample[name][None].astype(np.float32)) for name in PROJECTION}
         clouds = {
-            "points": place_points(points, sample["translation"], sample["present"]),
-            "photons": (sample["photon_hit"], sample["photon_valid"]),
+            "point_coverage": place_points(points, sample["translation"], sample["present"]),
+            "photon_coverage": (sample["photon_hit"], sample["photon_valid"]),
         }
         for name, (position, valid) in clouds.items():
             pixels = visible_pixels(torch.from_numpy(position)[None], torch.from_numpy(valid)[None], **camera)
@@ -125,8 +125,8 @@ def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
     return [
         _transport(facts),
         _view_direction(facts),
-        _count("points", spec.points, [fact.points for fact in facts]),
-        _count("photons", spec.photons, [fact.photons for fact in facts]),
+        _count("points", spec.num_points, [fact.point_coverage for fact in facts]),
+        _count("photons", spec.num_photons, [fact.photon_coverage for fact in facts]),
     ]
 
 
@@ -177,6 +177,6 @@ def table(advice: list[Advice], facts: list[Facts]) -> str:
     lines += ["", "Share of the pixels with a surface that hold at least one of so many, mean over random views:", ""]
     lines += [f"| | {' | '.join(f'{n:,}' for n in _COUNTS)} |", "|---|" + "---:|" * len(_COUNTS)]
     for fact in facts:
-        for name, curve in (("points", fact.points), ("photons", fact.photons)):
+        for name, curve in (("points", fact.point_coverage), ("photons", fact.photon_coverage)):
             lines.append(f"| {fact.scene}: {name} | " + " | ".join(f"{curve[n]:.0%}" for n in _COUNTS) + " |")
     return "\n".join(lines) + "\n"

@@ -71,7 +71,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
         **begun,
         **surroundings(search.device, search.policy),
         "select": space.name,
-        **space.model_dump(include={"methods", "sizes", "points", "photons", "minutes"}),
+        **space.model_dump(include={"methods", "sizes", "point_counts", "photon_counts", "minutes"}),
         "seeds": search.seeds,
         "rungs": search.rounds,
         "budget_spent_min": round(search.spent / 60, 2),

@@ -21,31 +21,31 @@ from nlt.paths import config_names, find_config
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model of the space; `points` and `photons` are None where the method reads none."""
+    """A model of the space; `num_points` and `num_photons` are None where the method reads none."""
 
     method: str
     size: str
-    points: int | None
-    photons: int | None
+    num_points: int | None
+    num_photons: int | None
 
     @property
     def name(self) -> str:
         """The candidate's name, for example "nlt@small, 1,024 points"."""
-        counts = ((self.points, "points"), (self.photons, "photons"))
+        counts = ((self.num_points, "points"), (self.num_photons, "photons"))
         return ", ".join([f"{self.method}@{Path(self.size).stem}", *(f"{n:,} {what}" for n, what in counts if n)])
 
     @property
     def slug(self) -> str:
         """The candidate's name as a directory name."""
-        parts = (self.method.replace("/", "-"), Path(self.size).stem, self.points, self.photons)
+        parts = (self.method.replace("/", "-"), Path(self.size).stem, self.num_points, self.num_photons)
         return "-".join(str(part) for part in parts if part)
 
 
 class SearchSpace(Settings):
     """The candidates: every method in every size, with every number of points and of photons that it reads.
 
-    `methods` and `sizes` go from the leanest to the largest, `points` and `photons` ascend; the last ones make the full
-    model. `data` and `scale` are configs, and `name` is the file's unless it is given.
+    `methods` and `sizes` go from the leanest to the largest, `point_counts` and `photon_counts` ascend; the last ones
+    make the full model. `data` and `scale` are configs, and `name` is the file's unless it is given.
     """
 
     name: str
@@ -53,12 +53,12 @@ class SearchSpace(Settings):
     scale: str
     methods: tuple[str, ...] = Field(min_length=1)
     sizes: tuple[str, ...] = Field(min_length=1)
-    points: tuple[PositiveInt, ...] = Field(min_length=1)
-    photons: tuple[PositiveInt, ...] = Field(min_length=1)
+    point_counts: tuple[PositiveInt, ...] = Field(min_length=1)
+    photon_counts: tuple[PositiveInt, ...] = Field(min_length=1)
     minutes: PositiveFloat
     seeds: PositiveInt = 1
 
-    @field_validator("methods", "sizes", "points", "photons")
+    @field_validator("methods", "sizes", "point_counts", "photon_counts")
     @classmethod
     def _unique(cls, values: tuple) -> tuple:
         if len(set(values)) < len(values):
@@ -90,8 +90,8 @@ class SearchSpace(Settings):
 
     def _check(self, file: Path) -> None:
         """Check what several configs say together."""
-        for key in ("points", "photons"):
-            has, most = getattr(self.spec, key), getattr(self, key)[-1]
+        for key, has in (("point_counts", self.spec.num_points), ("photon_counts", self.spec.num_photons)):
+            most = getattr(self, key)[-1]
             if most > has:
                 raise UserError(f"{file}: {key}: {most} is more than the {has} of the dataset")
         scale = find_config("scale", self.scale)
@@ -124,8 +124,8 @@ class SearchSpace(Settings):
         for method in reversed(self.methods):
             inputs = self.build(Candidate(method, self.sizes[-1], None, None)).fields
             reads = lambda prefix, names=inputs: any(name.startswith(prefix) for name in names)
-            points = self.points if reads("point_") else (None,)
-            photons = self.photons if reads("photon_") else (None,)
+            points = self.point_counts if reads("point_") else (None,)
+            photons = self.photon_counts if reads("photon_") else (None,)
             combinations = list(itertools.product([method], self.sizes, points, photons))[::-1]
             order = sorted(range(len(combinations)), key=lambda k: _van_der_corput(k, len(combinations)))
             columns.append([Candidate(*combinations[k]) for k in order])
@@ -140,10 +140,10 @@ class SearchSpace(Settings):
     def config(self, candidate: Candidate) -> dict[str, Any]:
         """Return the config with which `nlt fit` trains a candidate."""
         limits = {}
-        if candidate.points not in (None, self.spec.points):
-            limits["max_points"] = candidate.points
-        if candidate.photons not in (None, self.spec.photons):
-            limits["max_photons"] = candidate.photons
+        if candidate.num_points not in (None, self.spec.num_points):
+            limits["max_points"] = candidate.num_points
+        if candidate.num_photons not in (None, self.spec.num_photons):
+            limits["max_photons"] = candidate.num_photons
         return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
 
     def _config(self, method: str, size: str) -> dict[str, Any]:
@@ -152,7 +152,7 @@ class SearchSpace(Settings):
 
     def build(self, candidate: Candidate) -> RenderingModule:
         """Return the candidate's untrained model."""
-        sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.points}
+        sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.num_points}
         module = build(self.config(candidate), find_config("model", candidate.method), **sizes)
         assert isinstance(module, RenderingModule)
         return module

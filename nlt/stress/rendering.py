@@ -177,7 +177,7 @@ def _points(perturber: ViewPerturber, view_set: ViewSet) -> Points:
     """Return the point cloud of a set: training's in the changed scene, or another draw."""
     if view_set.ladder == DRAWS:
         spec = perturber.render.spec
-        return sample_points(perturber.scene, spec.points, spec.seed + view_set.severity)
+        return sample_points(perturber.scene, spec.num_points, spec.seed + view_set.severity)
     if isinstance(perturber.scene, ChangedScene):
         return perturber.scene.moved_points()
     return perturber.lit_points()

@@ -25,14 +25,14 @@ from nlt.models.nlt import NeuralLightTransport
 pytest_plugins = ["training_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
-GRID = {"resolution": (8,), "points": (32,), "photons": (32,), "width": (4,), "batch": (2,)}
+GRID = {"resolution": (8,), "num_points": (32,), "num_photons": (32,), "width": (4,), "batch": (2,)}
 METHODS = ("cnn", "nlt_photons", "oidn_1")
 SIZE = {"width": 3, "depth": 2, "num_scenes": SCENES, "num_points": POINTS}
 
 
 def test_the_plain_path_is_plain():
     """The plain path is float32 and contiguous for any method, and does not share its weights."""
-    method = NeuralLightTransport(photons=True, **SIZE)
+    method = NeuralLightTransport(use_photons=True, **SIZE)
     slow = plain(method.to(memory_format=torch.channels_last)).eval()
     seen = []
     for module in slow.modules():
@@ -119,7 +119,7 @@ def arguments(tmp_path_factory):
 def made(arguments, tmp_path_factory):
     """Return the directory of a benchmark that was killed once, and the names of all measurements."""
     out = tmp_path_factory.mktemp("out")
-    command = [*arguments, "--growth", "--set", "points=48", "--device", "cpu", "--out", str(out)]
+    command = [*arguments, "--growth", "--set", "num_points=48", "--device", "cpu", "--out", str(out)]
     measured, original = [], bench.Benchmark.measure
 
     def measure(self, part):
@@ -213,7 +213,7 @@ def test_what_would_take_too_long_is_skipped_and_said(arguments, tmp_path, monke
         (["--methods", "gan"], ("--methods", "gan", "nlt_photons")),
         (["--growth", "gan"], ("--growth", "gan")),
         (["--set", "colour=3"], ("--set", "colour", "photons")),
-        (["--set", "points=many"], ("--set", "points", "many")),
+        (["--set", "num_points=many"], ("--set", "num_points", "many")),
         (["--set", "resolution=4"], ("--set", "resolution", "8")),
         (["--set", "points"], ("--set", "KEY=VALUE")),
         (["--device", "tpu"], ("--device", "tpu")),

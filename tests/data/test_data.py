@@ -77,7 +77,7 @@ def test_nothing_is_pickled(dataset):
 
 @pytest.mark.parametrize(
     "change",
-    [{"resolution": 0}, {"train": -1}, {"points": 0}, {"photons": 1.5}, {"shard_size": 0}, {"seed": -1},
+    [{"resolution": 0}, {"train": -1}, {"num_points": 0}, {"num_photons": 1.5}, {"shard_size": 0}, {"seed": -1},
      {"experiment": "moving"}, {"scenes": []}, {"scenes": "living_room"}, {"reference_spp": True},
      {"reference_mse": -1e-4}, {"reference_mse": "1e-4"}, {"reference_mse": True}, {"reference_mse": float("nan")},
      {"reference_mse": float("inf")}],
@@ -92,9 +92,9 @@ def test_spec_is_written_as_ever():
     """The name of a dataset's directory is a hash of these bytes."""
     written = json.dumps(dataclasses.asdict(DatasetSpec(["living_room"], reference_mse=0)), sort_keys=True)
     assert written == (
-        '{"experiment": "moving_lights", "input_spp": 4, "noisy_spp": 1, "photons": 10000, "points": 10000, '
-        '"reference_mse": 0.0, "reference_spp": 64, "resolution": 64, "scenes": ["living_room"], "seed": 0, '
-        '"shard_size": 64, "teacher": "scene", "test": 64, "train": 1000, "val": 16}'
+        '{"experiment": "moving_lights", "input_spp": 4, "integrator": "scene", "noisy_spp": 1, "num_photons": 10000, '
+        '"num_points": 10000, "reference_mse": 0.0, "reference_spp": 64, "resolution": 64, "scenes": ["living_room"], '
+        '"seed": 0, "shard_size": 64, "test": 64, "train": 1000, "val": 16}'
     )
 
 

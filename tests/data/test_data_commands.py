@@ -139,7 +139,7 @@ def test_no_dataset(action, tmp_path, capfd):
 
 
 def test_stats(dataset, tmp_path, monkeypatch, capfd):
-    paper = {"resolution": 24, "train": 100_000, "val": 2, "test": 46, "photons": 50}
+    paper = {"resolution": 24, "train": 100_000, "val": 2, "test": 46, "num_photons": 50}
     (tmp_path / "scale").mkdir()
     (tmp_path / "scale" / "paper.yaml").write_text(yaml.safe_dump({"data": {"dataset": paper}}))
     monkeypatch.setattr(stats, "CONFIGS", tmp_path)

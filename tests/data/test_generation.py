@@ -183,7 +183,7 @@ def test_no_pilots_without_references():
 
 # ---- interruption ---------------------------------------------------------------------------------------
 
-LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "points": 16, "photons": 16,
+LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "num_points": 16, "num_photons": 16,
         "input_spp": 1, "reference_spp": 1, "shard_size": 64}  # fmt: skip
 # The trial of the renderer before the first job would be half of the time.
 RUN = f"""if __name__ == "__main__":

@@ -337,7 +337,7 @@ def test_manifest(world):
     assert (record["seeds"], record["n_test"]) == ([3], 3)
     assert record["versions"]["torch"] == torch.__version__
     assert record["wall_time_s"] > 0 and record["device"]
-    assert record["teachers"] == {"living_room": "path"}
+    assert record["integrators"] == {"living_room": "path"}
 
 
 # ---- run again ------------------------------------------------------------------------------------------

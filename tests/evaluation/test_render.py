@@ -45,7 +45,7 @@ def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     torch.manual_seed(0)
     size = {"width": 2, "depth": 1}
-    methods = {"nlt": NeuralLightTransport(photons=True, num_points=200, **size), "splat": PhotonSplat(**size)}
+    methods = {"nlt": NeuralLightTransport(use_photons=True, num_points=200, **size), "splat": PhotonSplat(**size)}
     files = {name: folder / f"{name}.safetensors" for name in methods}
     for name, method in methods.items():
         save_trained(method, spec_of(test=3), [], str(files[name]))
@@ -109,7 +109,7 @@ def test_traces_only_the_pixels_that_the_method_looks_at():
 
 
 def test_without_embeddings_any_scene_will_do():
-    method = NeuralLightTransport(points=False, photons=True, width=2, depth=1)
+    method = NeuralLightTransport(use_points=False, use_photons=True, width=2, depth=1)
     assert _with_scene(method, spec_of(), "bedroom", "a.ckpt")[0].scenes == ["bedroom"]
 
 
@@ -249,7 +249,7 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     refused(["render", models.splat, "palace"], "palace", "known scenes")
     refused(["render", models.nlt, "bedroom"], "bedroom", "embeddings", "living_room")
     method, *_ = load_trained(str(models.nlt))
-    save_trained(method, spec_of(points=300), [], "more.safetensors")
+    save_trained(method, spec_of(num_points=300), [], "more.safetensors")
     refused(["render", "more.safetensors", "living_room"], "200 points", "300")
     save_trained(method, spec_of(), [0], "other.safetensors")
     refused(["render", "other.safetensors", "living_room", *tiny, "-o", "other"], "other.safetensors", "other points")

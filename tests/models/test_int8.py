@@ -93,7 +93,7 @@ def test_accelerate_takes_large_ones(monkeypatch):
 def test_bfloat16_computes_what_autocast_does():
     torch.manual_seed(0)
     method, batch = (
-        NeuralLightTransport(photons=True, width=4, num_points=POINTS, num_scenes=SCENES).eval(),
+        NeuralLightTransport(use_photons=True, width=4, num_points=POINTS, num_scenes=SCENES).eval(),
         synthetic_batch(),
     )
     with torch.no_grad():

@@ -173,7 +173,7 @@ def test_a_scale_without_class_path_is_merged(tmp_path):
     scale.write_text("model:\n  init_args:\n    depth: 1\n")
     method = build(next(path for path in CONFIGS if path.stem == "nlt_photons"), scale)
     assert isinstance(method, NeuralLightTransport)
-    assert method.hparams["depth"] == 1 and method.hparams["photons"]
+    assert method.hparams["depth"] == 1 and method.hparams["use_photons"]
 
 
 @pytest.mark.parametrize("name", ["cnn", "nlt_photons", "photons_only"])
@@ -295,9 +295,9 @@ def test_checkpoint_loads_with_weights_only(checkpoints):
         ),
         (
             NeuralLightTransport,
-            {"photons": True},
+            {"use_photons": True},
             "nlt",
-            "checkpoint has photons=False, this model photons=True",
+            "checkpoint has use_photons=False, this model use_photons=True",
         ),
         (
             NeuralLightTransport,

@@ -121,7 +121,7 @@ def test_a_method_without_albedo_predicts_radiance():
 def test_training_computes_the_photons_that_are_seen(points):
     """The same map and the same gradients as from all photons, and the network is given fewer."""
     batch = {k: v.double() if v.is_floating_point() else v for k, v in synthetic_batch().items()}
-    method = NeuralLightTransport(points=points, photons=True, **SIZE).double()
+    method = NeuralLightTransport(use_points=points, use_photons=True, **SIZE).double()
     given = []
     method.photon_network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0].numel() // 9))
     images, gradients = [], []

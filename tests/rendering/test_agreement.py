@@ -246,7 +246,7 @@ def test_emission_of_the_environment(tmp_path, sky):
 
 def test_noisy_and_input_have_the_references_expectation():
     """Over many samples, the residuals of all pixels have mean 0 and are uncorrelated."""
-    spec = DatasetSpec(["living_room"], resolution=8, test=120, points=1, photons=1, reference_spp=16)
+    spec = DatasetSpec(["living_room"], resolution=8, test=120, num_points=1, num_photons=1, reference_spp=16)
     render = SampleRenderer(spec, 0)
     samples = [render.sample("test", k) for k in range(spec.test)]
     images = {n: np.stack([s[n] for s in samples]).astype(float) for n in ("noisy", "noisy_input", "reference_a")}

@@ -144,10 +144,10 @@ def furnace():
     return {"walls": mesh(walls, {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}, area(1, 1, 1))}
 
 
-def renderer_of(parts, teacher):
+def renderer_of(parts, integrator):
     _ALIVE.append(mi.load_dict({"type": "scene", **parts}))
-    description = SimpleNamespace(units_per_metre=1.0, room=None, teacher=teacher)
-    return Renderer(SimpleNamespace(mi_scene=_ALIVE[-1], description=description), teacher)
+    description = SimpleNamespace(units_per_metre=1.0, room=None, integrator=integrator)
+    return Renderer(SimpleNamespace(mi_scene=_ALIVE[-1], description=description), integrator)
 
 
 VIEW = Camera.look_at(np.array([0.3, 0.1, 0.9]), np.array([-0.2, -0.3, -1]), np.array([0, 1, 0]), 80, SIZE, SIZE)
@@ -220,13 +220,13 @@ def test_states_and_pixels(renderer, demo):
 
 def test_choosing(tmp_path, monkeypatch, caplog):
     """The dataset overrules the scene; where only `path` can run, only the scene's choice gives way."""
-    scene = str(write_yaml(tmp_path / "scene.yaml", teacher="bdpt"))
-    of = lambda **more: SampleRenderer(DatasetSpec([scene], "fixed_lights", **more), 0).renderer.teacher
-    assert (of(), of(teacher="path"), of(teacher="bdpt")) == ("bdpt", "path", "bdpt")
-    with pytest.raises(UserError, match=r"data\.dataset\.teacher: must be one of scene, path, bdpt, is 'photons'"):
-        DatasetSpec([scene], teacher="photons")
+    scene = str(write_yaml(tmp_path / "scene.yaml", integrator="bdpt"))
+    of = lambda **more: SampleRenderer(DatasetSpec([scene], "fixed_lights", **more), 0).renderer.integrator_name
+    assert (of(), of(integrator="path"), of(integrator="bdpt")) == ("bdpt", "path", "bdpt")
+    with pytest.raises(UserError, match=r"data\.dataset\.integrator: must be one of scene, path, bdpt, is 'photons'"):
+        DatasetSpec([scene], integrator="photons")
     described = Scene(load_description(scene), "fixed_lights")
     monkeypatch.setattr(renderer_module, "is_jit", lambda: False)
-    assert Renderer(described).teacher == "path" and "bdpt needs" in caplog.text
-    with pytest.raises(UserError, match="teacher: bdpt needs Mitsuba's llvm or cuda"):
+    assert Renderer(described).integrator_name == "path" and "bdpt needs" in caplog.text
+    with pytest.raises(UserError, match="integrator: bdpt needs Mitsuba's llvm or cuda"):
         Renderer(described, "bdpt")

@@ -204,7 +204,7 @@ def test_failures_are_those_of_the_file(stored):
     assert latex_tables((stored / "failures.tex").read_text()) == [shown]
 
 
-def test_the_teacher_is_named(stored):
+def test_the_integrator_is_named(stored):
     note = "inputs of OIDN and denoising are rendered with bdpt in egg."
     assert note in (stored / "table.md").read_text() and "kitchen" not in (stored / "table.md").read_text()
     assert html.unescape((stored / "report.html").read_text()).count(note) == 1

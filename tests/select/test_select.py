@@ -92,7 +92,7 @@ def facts(moving=(), lights=(), materials=None, points=None, photons=None):
 
 def test_advice_of_several_scenes():
     """A dataset needs what any of its scenes needs."""
-    spec = DatasetSpec(["egg", "kitchen"], points=4096, photons=300)
+    spec = DatasetSpec(["egg", "kitchen"], num_points=4096, num_photons=300)
     some = [facts(["cup"]), facts(["lamp", "cup"], ["lamp"], {"diffuse": 0.5, "mirror": 0.5})]
     transport, direction, *_ = advice.advise(spec, some)
     assert transport.verdict.startswith("photons") and "lamp" in transport.reason and "cup" not in transport.reason
@@ -121,7 +121,8 @@ def test_enough():
         curve = {n: 1 - np.exp(-rate * n) for n in advice._COUNTS}
         gains = [(n, curve[n] - curve[n // 2]) for n in advice._COUNTS[1:]]
         assert advice.enough(curve) == max(n for n, gain in gains if gain >= 0.05)
-        points, photons = advice.advise(DatasetSpec(["egg"], points=1 << 20, photons=64), [facts(points=curve)])[2:]
+        spec = DatasetSpec(["egg"], num_points=1 << 20, num_photons=64)
+        points, photons = advice.advise(spec, [facts(points=curve)])[2:]
         assert points.verdict == f"{advice.enough(curve):,} of {1 << 20:,}"
         assert photons.verdict == "all 64"
     assert advice.enough(dict.fromkeys(advice._COUNTS, 0.9)) == min(advice._COUNTS)
@@ -129,7 +130,7 @@ def test_enough():
 
 def test_coverage_is_that_of_the_area_seen(variant):
     """The measured occupancy of points is Poisson's for the area that each pixel sees."""
-    spec = DatasetSpec(["egg"], "static", resolution=16, points=1 << 14, photons=64, train=0, val=0, test=3)
+    spec = DatasetSpec(["egg"], "static", resolution=16, num_points=1 << 14, num_photons=64, train=0, val=0, test=3)
     found = advice._facts(spec, 0)
     render, shares = SampleRenderer(spec, 0), []
     area = sum(s.face_areas.sum() for s in render.scene.shapes.values()) * float(render.points()["area_share"])
@@ -145,7 +146,7 @@ def test_coverage_is_that_of_the_area_seen(variant):
         seen = np.linalg.norm(np.cross((corner[1] - corner[0]).T, (corner[3] - corner[2]).T), axis=1) / 2
         shares.append(seen[sample["depth"].ravel() > 0] / area)
     for n in (128, 512, 2048):
-        assert abs(found.points[n] - np.mean([np.mean(1 - np.exp(-n * share)) for share in shares])) < 0.03
+        assert abs(found.point_coverage[n] - np.mean([np.mean(1 - np.exp(-n * share)) for share in shares])) < 0.03
 
 
 # ---- fewer points and photons ---------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def test_thin():
     kinds = torch.repeat_interleave(torch.arange(4), torch.tensor([50, 10, 30, 10]))
     batch = {"photon_flux": torch.rand(2, 100, 3), "photon_origin": kinds.float().view(1, -1, 1).expand(2, -1, 3)}
     batch |= {"photon_hit": torch.rand(2, 100, 3), "point_position": torch.rand(2, 9, 3), "depth": torch.ones(2)}
-    module = NeuralLightTransport(photons=True, width=2, num_points=9, max_points=4, max_photons=20)
+    module = NeuralLightTransport(use_photons=True, width=2, num_points=9, max_points=4, max_photons=20)
     thin = module.subsample(batch)
     counts = np.bincount(thin["photon_origin"][0, :, 0].int().numpy())
     assert counts.tolist() == [10, 2, 6, 2]
@@ -284,7 +285,7 @@ def space(tiny, tmp_path, monkeypatch, one_thread):
     sizes = [str(write(tmp_path / f"{name}.yaml", {"model": {"init_args": size}})) for name, size in SIZES.items()]
     content = {
         "data": str(tiny.data), "scale": str(write(tmp_path / "scale.yaml", scale)), "methods": ["cnn", "nlt_photons"],
-        "sizes": sizes, "points": [64], "photons": [32, 64], "minutes": BUDGET_S / 60, "seeds": 2,
+        "sizes": sizes, "point_counts": [64], "photon_counts": [32, 64], "minutes": BUDGET_S / 60, "seeds": 2,
     }  # fmt: skip
     return write(tmp_path / "space.yaml", content)
 
@@ -418,9 +419,9 @@ def test_budget(space, monkeypatch, capsys, slower):
         ({"methods": ["cnm"]}, "methods: no 'cnm'"),
         ({"methods": []}, "methods: must be a list of at least 1"),
         ({"methods": ["oidn_1"]}, "methods: oidn_1 is not trained"),
-        ({"points": [65]}, "points: 65 is more than the 64"),
-        ({"photons": [0]}, "photons.0: must be above 0"),
-        ({"photons": [8, 8]}, "photons: must not have duplicates"),
+        ({"point_counts": [65]}, "point_counts: 65 is more than the 64"),
+        ({"photon_counts": [0]}, "photon_counts.0: must be above 0"),
+        ({"photon_counts": [8, 8]}, "photon_counts: must not have duplicates"),
         ({"minutes": 0}, "minutes: must be above 0"),
         ({"minutes": 1e-3}, "--minutes: 0.001 are too few"),
         ({"seeds": 0}, "seeds: must be above 0"),

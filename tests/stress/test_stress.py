@@ -74,7 +74,7 @@ def test_a_wrong_manifest(tmp_path, near, message):
 
 @pytest.fixture(scope="module")
 def spec():
-    return dataclasses.replace(spec_of(), test=4, points=600, experiment="moving_lights", resolution=32)
+    return dataclasses.replace(spec_of(), test=4, num_points=600, experiment="moving_lights", resolution=32)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Built-in scenes, made from small parametric furniture functions: no model files, no downloads."""
+"""Built-in scenes of parametric furniture: no model files, no downloads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nlt.scenes.model import Triangles
 
 __all__ = ["BUILTINS", "BuiltinShape", "Shapes", "living_room", "mitsuba_scene"]
 
-# Scene name -> shapes by stable id.
+# Scene name -> function that returns the shapes by id.
 BUILTINS: dict[str, Callable[[], Shapes]] = {
     "egg": egg,
     "living_room": living_room,
@@ -25,8 +25,8 @@ BUILTINS: dict[str, Callable[[], Shapes]] = {
 
 
 def mitsuba_scene(name: str) -> mi.Scene:
-    """The scene as a live Mitsuba scene, in the variant that is set."""
-    bsdfs: dict[int, Any] = {}  # by the dict's identity: each BSDF instance costs tracing time
+    """Build a built-in scene in the active Mitsuba variant."""
+    bsdfs: dict[int, Any] = {}  # by identity of the dict, because each BSDF instance costs tracing time
     meshes: dict[str, Any] = {}
     shapes = BUILTINS[name]()
     for key, shape in shapes.items():

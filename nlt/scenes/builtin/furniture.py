@@ -1,4 +1,4 @@
-"""Furniture of the built-in scenes: at the origin, on the floor, facing +z; what hangs has its back at z = 0."""
+"""Furniture of the built-in scenes: at the origin, on the floor, facing +z; hanging pieces have backs at z = 0."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def legs(width: float, depth: float, height: float, thick: float = 0.05) -> list
 
 
 def frame(width: float, height: float, border: float, depth: float) -> list[Box]:
-    """Four bars around an upright opening, their backs at z = 0."""
+    """Four bars around an upright opening, with their backs at z = 0."""
     x, y = (width + border) / 2, (height + border) / 2
     bars: list[Box] = [((s * x, 0, depth / 2), (border, height + 2 * border, depth)) for s in (-1, 1)]
     return bars + [((0, s * y, depth / 2), (width, border, depth)) for s in (-1, 1)]
@@ -46,9 +46,9 @@ def frame(width: float, height: float, border: float, depth: float) -> list[Box]
 
 
 def room(size: Vec, floor: Bsdf, ceiling: Bsdf, walls: Sequence[Bsdf], floor_tile: float = 2.0) -> Shapes:
-    """Six quads that face inward, middle of the floor at the origin; walls: left, right, back, front."""
+    """Six quads that face inward, with the middle of the floor at the origin; walls: left, right, back, front."""
     x, y, z = size[0] / 2, size[1], size[2] / 2
-    e = 0.01  # each quad reaches past the corners, so no ray slips through them
+    e = 0.01  # each quad extends past the corners, so that no ray slips through them
     w, h, d = 2 * (x + e), y + 2 * e, 2 * (z + e)
     left, right, back, front = walls
     return {
@@ -71,15 +71,15 @@ def skirting(bsdf: Bsdf, size: Vec, height: float = 0.08) -> BuiltinShape:
 def area_light(width: float, height: float, light: Vec, border: Bsdf) -> Shapes:
     """A framed panel that shines towards +z.
 
-    The panel is flush with the frame's front: a frame that saw the panel at grazing distance would be
-    a small, very bright thing, which one-sample path tracing turns into fireflies.
+    The panel is flush with the front of the frame. Otherwise it would light the inner side of the frame from a very
+    short distance, and one-sample path tracing would turn these small, very bright areas into fireflies.
     """
     panel = quads(border, ((-width / 2, -height / 2, 0.04), (width, 0, 0), (0, height, 0)), emitter=area(rgb(*light)))
     return {"panel": panel, "frame": boxes(border, *frame(width, height, 0.05, 0.04))}
 
 
 def ceiling_light(width: float, depth: float, light: Vec, border: Bsdf) -> Shapes:
-    """A framed panel that shines down, its top at the origin."""
+    """A framed panel that shines down, with its top at the origin."""
     return {k: transform(s, turn=90, axis=(1, 0, 0)) for k, s in area_light(width, depth, light, border).items()}
 
 
@@ -92,9 +92,9 @@ def window(
     grid: tuple[int, int] = (2, 2),
     trees: Bsdf | None = None,
 ) -> Shapes:
-    """Shining panes of width x height in all, with mullions between them and a sill; its middle at the origin.
+    """Shining panes of total size width x height, with mullions and a sill, centred at the origin.
 
-    `trees` stand before the sky and do not shine. The mullions are flush with the panes, see `area_light`.
+    `trees` stand in front of the sky and do not shine. The mullions are flush with the panes, see `area_light`.
     """
     (nx, ny), bar = grid, 0.045
     w, h = width / nx, height / ny
@@ -142,7 +142,7 @@ def door(leaf: Bsdf, border: Bsdf, handle: Bsdf, width: float = 0.85, height: fl
 
 
 def curtain(fabric: Bsdf, width: float, height: float, folds: int = 7) -> BuiltinShape:
-    """Hanging folds, their top at the origin."""
+    """A curtain of hanging folds, with its top at the origin."""
     radius = 0.62 * width / folds
     profile = [(0, -height), (1.25 * radius, -height), (radius, 0), (0, 0)]
     places = [(x, 0, 0.06 + 0.015 * (k % 2)) for k, x in enumerate(_spread(width, folds))]
@@ -150,7 +150,7 @@ def curtain(fabric: Bsdf, width: float, height: float, folds: int = 7) -> Builti
 
 
 def curtains(fabric: Bsdf, pole: Bsdf, opening: float, width: float, height: float) -> Shapes:
-    """Two curtains and their pole, the pole's middle above the origin."""
+    """Two curtains and their pole, whose middle is above the origin."""
     x = (opening + width) / 2
     end = opening / 2 + width + 0.08
     knobs = [ball(pole, 0.03, (s * end, 0.02, 0.065), subdivisions=2) for s in (-1, 1)]
@@ -161,7 +161,7 @@ def curtains(fabric: Bsdf, pole: Bsdf, opening: float, width: float, height: flo
 
 
 def hung(bsdf: Bsdf, border: Bsdf, width: float, height: float) -> Shapes:
-    """A picture or mirror in a frame, its middle at the origin."""
+    """A picture or mirror in a frame, centred at the origin."""
     return {
         "panel": boxes(bsdf, ((0, 0, 0.0125), (width, height, 0.025)), tile=None),
         "frame": boxes(border, *frame(width, height, 0.05, 0.04)),
@@ -169,7 +169,7 @@ def hung(bsdf: Bsdf, border: Bsdf, width: float, height: float) -> Shapes:
 
 
 def radiator(paint: Bsdf, width: float = 1.0, height: float = 0.55) -> BuiltinShape:
-    """Ribs on two pipes and brackets."""
+    """A radiator: ribs on two pipes and brackets."""
     count = int(width / 0.07)
     parts: list[Box] = [((x, 0.12 + height / 2, 0.06), (0.05, height, 0.08)) for x in _spread(width, count)]
     parts += [((0, 0.12 + y, 0.06), (width - 0.03, 0.04, 0.04)) for y in (0.05, height - 0.05)]
@@ -197,7 +197,7 @@ def clock(face: Bsdf, dark: Bsdf, radius: float = 0.15) -> Shapes:
 
 
 def radiator_rail(steel: Bsdf, width: float = 0.5, height: float = 1.1) -> BuiltinShape:
-    """A ladder of bars to hang towels on, its foot at the origin."""
+    """A ladder of bars for towels, with its foot at the origin."""
     posts = [rod(steel, (s * width / 2, 0, 0.06), (s * width / 2, height, 0.06), 0.018) for s in (-1, 1)]
     levels = [y for y in np.linspace(0.06, height - 0.06, 9) if abs(y - 0.55) > 0.1]
     bars = [rod(steel, (-width / 2, y, 0.06), (width / 2, y, 0.06), 0.011) for y in levels]
@@ -234,7 +234,7 @@ def stool(wood: Bsdf, height: float = 0.45, radius: float = 0.17) -> Shapes:
 
 
 def sofa(fabric: Bsdf, cushion: Bsdf, width: float = 1.9, depth: float = 0.85, seats: int = 2) -> Shapes:
-    """With one seat, an armchair."""
+    """A sofa; with one seat, an armchair."""
     arm = 0.18
     inner = width - 2 * arm
     body: list[Box] = [((0, 0.18, 0), (inner, 0.24, depth)), ((0, 0.55, -depth / 2 + 0.1), (inner, 0.5, 0.2))]
@@ -265,7 +265,7 @@ def cupboard(
     rows: int = 1,
     plinth: float = 0.08,
 ) -> Shapes:
-    """A carcass with columns x rows doors, or drawers where they are wider than high; back at z = -depth/2."""
+    """A carcass with columns x rows doors, or drawers if wider than high; back at z = -depth/2."""
     width, height, depth = size
     w, h, z = width / columns, (height - plinth) / rows, depth / 2 - 0.01
     fronts: list[Box] = []
@@ -324,7 +324,7 @@ def books(count: int = 4, seed: int = 5) -> BuiltinShape:
 
 
 def _coloured(parts: Sequence[Any], colours: Sequence[Vec], rng: np.random.Generator) -> BuiltinShape:
-    """Boxes that each take one of the colours, as one shape of one texture."""
+    """Boxes of random colours, as one shape with one texture."""
     shape = boxes(diffuse(texture(np.asarray([colours]), nearest=True)), *parts)
     pick = rng.integers(len(colours), size=len(parts))
     uv = np.stack([(pick + 0.5) / len(colours), np.full(len(parts), 0.5)], axis=1)
@@ -332,7 +332,7 @@ def _coloured(parts: Sequence[Any], colours: Sequence[Vec], rng: np.random.Gener
 
 
 def wall_shelf(wood: Bsdf, width: float = 0.9, depth: float = 0.2, boards: int = 2, step: float = 0.35) -> BuiltinShape:
-    """Boards on brackets, the lowest one's top at the origin."""
+    """Boards on brackets, with the top of the lowest board at the origin."""
     parts: list[Box] = []
     for y in step * np.arange(boards):
         parts.append(((0, y - 0.0125, depth / 2), (width, 0.025, depth)))
@@ -341,7 +341,7 @@ def wall_shelf(wood: Bsdf, width: float = 0.9, depth: float = 0.2, boards: int =
 
 
 def bed(wood: Bsdf, linen: Bsdf, cover: Bsdf, width: float = 1.6, length: float = 2.05) -> Shapes:
-    """The head at the back."""
+    """A bed with its head at the back."""
     w, z = width / 2, length / 2
     parts: list[Box] = [((0, 0.22, 0), (width, 0.16, length)), ((0, 0.5, -z - 0.03), (width + 0.06, 1.0, 0.06))]
     pillows: list[Box] = [((s * w / 2, 0.6, -z + 0.27), (w - 0.12, 0.16, 0.42)) for s in (-1, 1)]
@@ -357,7 +357,7 @@ def bed(wood: Bsdf, linen: Bsdf, cover: Bsdf, width: float = 1.6, length: float 
 
 
 def shade(bsdf: Bsdf, low: float, high: float, bottom: float, top: float, light: Vec | None = None) -> BuiltinShape:
-    """A lampshade of two heights and their radii; with a radiance it glows, large and dim, and makes no fireflies."""
+    """A lampshade given by two heights and their radii. With a radiance it glows, large and dim, without fireflies."""
     cone = [(bottom + 0.005, low), (top + 0.005, high), (top, high), (bottom, low), (bottom + 0.005, low)]
     return replace(lathe(bsdf, cone), emitter=None if light is None else area(rgb(*light)))
 
@@ -378,7 +378,7 @@ def table_lamp(foot: Bsdf, cloth: Bsdf, light: Vec, height: float = 0.45) -> Sha
 
 
 def pendant(steel: Bsdf, cloth: Bsdf, light: Vec, drop: float, radius: float = 0.22) -> Shapes:
-    """A glowing shade on a cord, its top at the origin."""
+    """A glowing shade on a cord, with its top at the origin."""
     cord = [(0, -drop), (0.006, -drop), (0.006, -0.03), (0.05, -0.03), (0.05, 0), (0, 0)]
     return {"cord": lathe(steel, cord), "shade": shade(cloth, -drop - 0.12, -drop + 0.12, radius, 0.6 * radius, light)}
 

@@ -56,7 +56,7 @@ def area(radiance: dict[str, Any]) -> dict[str, Any]:
 
 
 def noise(rng: np.random.Generator, height: int, width: int, fu: float, fv: float) -> np.ndarray:
-    """Noise of up to about fu, fv cycles along u, v that repeats without a seam, -1..1."""
+    """Seamless noise in [-1, 1] of up to about `fu` and `fv` cycles along u and v."""
     spectrum = np.fft.rfft2(rng.standard_normal((height, width)))
     u, v = np.fft.rfftfreq(width) * width, np.fft.fftfreq(height) * height
     spectrum *= np.exp(-((u / fu) ** 2) - ((v[:, None] / fv) ** 2))
@@ -65,7 +65,7 @@ def noise(rng: np.random.Generator, height: int, width: int, fu: float, fv: floa
 
 
 def planks(colour: Vec, rows: int = 12, size: int = 384, seed: int = 0) -> np.ndarray:
-    """Wooden boards along u: a tone per board, dark joints and a grain that follows the board."""
+    """Wooden boards along u, each with its own tone and grain, with dark joints."""
     rng = np.random.default_rng(seed)
     image = np.ones((size, size))
     height = size // rows
@@ -83,13 +83,13 @@ def planks(colour: Vec, rows: int = 12, size: int = 384, seed: int = 0) -> np.nd
 
 
 def grain(colour: Vec, size: int = 128, seed: int = 1) -> np.ndarray:
-    """Wood along u."""
+    """Wood with its grain along u."""
     values = noise(np.random.default_rng(seed), size, size, 6, size / 3)
     return (1 + 0.3 * values[..., None]) * np.asarray(colour)
 
 
 def tiles(colours: Sequence[Vec], count: int = 4, joint: Vec = (0.4, 0.39, 0.37), size: int = 256) -> np.ndarray:
-    """count x count square tiles, colours by turns, each a little different, with joints."""
+    """count x count square tiles with joints; the colours alternate and vary slightly from tile to tile."""
     rng = np.random.default_rng(2)
     v, u = np.mgrid[:size, :size] * count / size
     row, column = v.astype(int), u.astype(int)
@@ -119,14 +119,14 @@ def terrazzo(colour: Vec, chips: Sequence[Vec], size: int = 256) -> np.ndarray:
 
 
 def cloth(colour: Vec, threads: int = 32, size: int = 128) -> np.ndarray:
-    """Coarse weave."""
+    """A coarse weave."""
     v, u = np.mgrid[:size, :size] * 2 * np.pi * threads / size
     tone = 0.9 + 0.12 * np.sin(u) * np.sin(v) + 0.1 * noise(np.random.default_rng(5), size, size, 40, 6)
     return np.clip(tone[..., None] * np.asarray(colour), 0, 0.95)
 
 
 def wicker(colour: Vec, count: int = 12, size: int = 192) -> np.ndarray:
-    """Basketwork: short strands that pass over and under by turns."""
+    """Basketwork: short strands that alternately pass over and under."""
     v, u = np.mgrid[:size, :size] * count / size
     over = (u.astype(int) + v.astype(int)) % 2 == 0
     tone = 0.35 + 0.65 * np.abs(np.sin(np.pi * np.where(over, v, u)))

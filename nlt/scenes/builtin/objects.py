@@ -1,4 +1,4 @@
-"""Smaller things of the built-in scenes, and bathroom and kitchen fittings: at the origin, facing +z."""
+"""Small objects of the built-in scenes, and bathroom and kitchen fittings: at the origin, facing +z."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def tap(steel: Bsdf, height: float = 0.22, reach: float = 0.14) -> BuiltinShape:
 
 
 def toilet(ceramic: Bsdf, seat: Bsdf, steel: Bsdf) -> Shapes:
-    """Its cistern's back at z = -0.33."""
+    """A toilet whose cistern has its back at z = -0.33."""
     pan = [(0, 0), (0.12, 0), (0.11, 0.1), (0.13, 0.22), (0.185, 0.36), (0.185, 0.4), (0.13, 0.4), (0.09, 0.27)]
     lid = [(0, 0.4), (0.19, 0.4), (0.19, 0.425), (0.175, 0.435), (0, 0.435)]
     cistern = rounded(ceramic, ((0, 0.58, -0.24), (0.4, 0.38, 0.18)), radius=0.04)
@@ -94,7 +94,7 @@ def toaster(steel: Bsdf, black: Bsdf) -> Shapes:
 
 
 def hood(steel: Bsdf, top: float) -> BuiltinShape:
-    """An extractor: a chimney up to `top` metres above its lower edge."""
+    """An extractor hood: a chimney up to `top` metres above its lower edge."""
     parts: list[Box] = [((0, 0.03, 0.245), (0.62, 0.06, 0.49)), ((0, (top + 0.2) / 2, 0.14), (0.24, top - 0.2, 0.24))]
     for k in range(7):
         parts.append(((0, 0.07 + 0.02 * k, 0.24 - 0.014 * k), (0.6 - 0.05 * k, 0.02, 0.48 - 0.034 * k)))
@@ -110,7 +110,7 @@ def vase(bsdf: Bsdf, height: float = 0.6) -> Shapes:
 
 
 def plant(clay: Bsdf, leaf: Bsdf, height: float = 0.9, spread: float = 0.28, leaves: int = 40, seed: int = 0) -> Shapes:
-    """Long leaves out of a pot."""
+    """A pot plant with long leaves."""
     rng = np.random.default_rng(seed)
     rim, deep = 0.42 * spread + 0.03, 0.3 * height
     body = [(0, 0), (0.7 * rim, 0), (rim, deep), (rim - 0.012, deep), (rim - 0.02, 0.85 * deep), (0, 0.85 * deep)]
@@ -139,7 +139,7 @@ def basket(bsdf: Bsdf, size: Vec = (0.4, 0.45, 0.32)) -> BuiltinShape:
 
 
 def teddy(fur: Bsdf, dark: Bsdf, size: float = 0.3) -> Shapes:
-    """A bear that sits."""
+    """A sitting teddy bear."""
     parts: list[tuple[Vec, float, Vec]] = [((0, 0.3, 0), 0.27, (1, 1.1, 0.9)), ((0, 0.72, 0.02), 0.2, (1, 1, 1))]
     parts += [((0, 0.68, 0.18), 0.09, (1, 0.8, 1))]
     parts += [((s * 0.15, 0.89, 0), 0.08, (1, 1, 0.6)) for s in (-1, 1)]
@@ -154,7 +154,7 @@ def teddy(fur: Bsdf, dark: Bsdf, size: float = 0.3) -> Shapes:
 
 
 def egg_of(bsdf: Bsdf, height: float, at: Vec) -> BuiltinShape:
-    """Standing on its blunt end."""
+    """An egg that stands on its blunt end."""
     angle = np.linspace(0, np.pi, 40)
     y = (1 - np.cos(angle)) / 2
     radius = 0.36 * np.sin(angle) * (1 + 0.18 * np.cos(angle))
@@ -172,7 +172,7 @@ def jar(bsdf: Bsdf, height: float, at: Vec) -> BuiltinShape:
 
 
 def flowers(petal: Bsdf, stalk: Bsdf, height: float = 0.4, count: int = 7) -> Shapes:
-    """Tulips, their stalks from the origin."""
+    """Tulips whose stalks start at the origin."""
     rng = np.random.default_rng(11)
     heads = [(*rng.uniform(-0.09, 0.09, 2), y) for y in height * rng.uniform(0.8, 1.1, count)]
     return {

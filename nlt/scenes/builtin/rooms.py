@@ -1,4 +1,4 @@
-"""The built-in scenes: inventories of furniture. A shape's id is `piece_part`, or `piece` where it is the only part."""
+"""The built-in scenes, as inventories of furniture. Shape ids are `piece_part`, or `piece` if it has only one part."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ from nlt.scenes.builtin.objects import (
 from nlt.scenes.builtin.shapes import Shapes, ball, boxes, join, lathe, place, rod, rounded, transform
 
 SKY = (0.5, 0.8, 1.25)  # radiance of a window
-OVERCAST = (0.35, 0.45, 0.6)  # reflectance of a window that is turned off
+OVERCAST = (0.35, 0.45, 0.6)  # reflectance of a window whose light is turned off
 
 
 def egg() -> Shapes:
-    """After Veach's scene: a lamp that lights the ceiling, a spot lamp in a shade, a glass egg on a table."""
+    """A scene after Veach: a lamp that lights the ceiling, a spot lamp in a shade, a glass egg on a table."""
     paint = diffuse(rgb(0.8, 0.76, 0.68))
     boards = rough_plastic(texture(planks((0.55, 0.4, 0.25))), 0.25)
     wood = diffuse(texture(grain((0.5, 0.3, 0.15))))

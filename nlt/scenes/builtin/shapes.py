@@ -1,4 +1,4 @@
-"""The shape of the built-in scenes, and the primitives that furniture is made of."""
+"""The shapes of the built-in scenes, and the primitives of which furniture consists."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def quads(
     tile: float | None = 1.0,
     emitter: dict[str, Any] | None = None,
 ) -> BuiltinShape:
-    """Flat parallelograms (origin, u, v) that face u x v; a texture repeats every `tile` metres or fits."""
+    """Flat parallelograms (origin, u, v) that face u x v; a texture repeats every `tile` metres; None fits it once."""
     points, uvs = [], []
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
     for origin, u, v in corners:
@@ -94,7 +94,7 @@ def ring(bsdf: Bsdf, radius: float, width: float, height: float, at: Vec = (0, 0
 
 
 def disc(bsdf: Bsdf, radius: float, light: dict[str, Any], sections: int = 32) -> BuiltinShape:
-    """A light that shines upwards, its middle at the origin."""
+    """A circular light that shines upwards, with its centre at the origin."""
     angle = np.linspace(0, -2 * np.pi, sections, endpoint=False)
     rim = radius * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], 1)
     k = np.arange(sections)
@@ -114,14 +114,14 @@ def ball(bsdf: Bsdf, radius: float, at: Vec, stretch: Vec = (1, 1, 1), subdivisi
 
 
 def smooth(bsdf: Bsdf, mesh: trimesh.Trimesh, at: Vec) -> BuiltinShape:
-    """Smooth shading except across edges sharper than 40 degrees."""
+    """Create a mesh with smooth shading except across edges sharper than 40 degrees."""
     mesh = trimesh.graph.smooth_shade(mesh, angle=np.radians(40), facet_minarea=None)
     mesh.apply_translation(at)
     return BuiltinShape(mesh, None, bsdf, smooth=True)
 
 
 def join(*shapes: BuiltinShape) -> BuiltinShape:
-    """Shapes of one material as one shape, without texture coordinates."""
+    """Join shapes of one material into one shape without texture coordinates."""
     mesh = _concatenate([shape.mesh for shape in shapes])
     return BuiltinShape(mesh, None, shapes[0].bsdf, smooth=True)  # a flat shape's vertex normals are flat too
 
@@ -133,12 +133,12 @@ def _concatenate(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def transform(shape: BuiltinShape, at: Vec = (0, 0, 0), turn: float = 0.0, axis: Vec = (0, 1, 0)) -> BuiltinShape:
-    """Turned about an axis through the origin by `turn` degrees, then moved."""
+    """Turn a shape about an axis through the origin by `turn` degrees, then move it."""
     matrix = trimesh.transformations.rotation_matrix(np.radians(turn), axis)
     matrix[:3, 3] = at
     return replace(shape, mesh=shape.mesh.copy().apply_transform(matrix))  # copied: trimesh transforms in place
 
 
 def place(shapes: Shapes, name: str, at: Vec, turn: float = 0.0) -> Shapes:
-    """The shapes as `name_part`, turned about y by `turn` degrees and moved."""
+    """Name the shapes `name_part`, turn them about y by `turn` degrees and move them."""
     return {f"{name}_{part}": transform(shape, at, turn) for part, shape in shapes.items()}
