@@ -18,7 +18,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from nlt.data.dataset import LightTransportDataset, identity_collate
-from nlt.data.spec import load_spec
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.provenance import origin, surroundings
@@ -49,14 +48,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/bench/precision.json"))
     options = parser.parse_args()
     comparison = Comparison.load(options.config, None, None, options.methods, options.seeds)
-    spec, root = load_spec([str(comparison.data), str(comparison.scale)])
+    spec, root = comparison.spec, comparison.root
     directory, device = spec.directory(root), torch.device("cpu")
     report: dict[str, Any] = {"options": {k: str(v) for k, v in vars(options).items()}, "views": spec.test}
     report |= {"manifest": origin() | surroundings(device), "methods": {}, "missing": []}
     for name in comparison.methods:
         for seed in comparison.seeds:
             training = Training.of(comparison, name, seed, Path("runs") / directory.name)
-            if not training.took:
+            if not training.outcome:
                 report["missing"].append(training.name)
                 print(f"{training.name}: not trained; nlt compare --config {options.config} trains it", flush=True)
                 continue

@@ -22,7 +22,7 @@ from nlt import paths
 from nlt.cli import _LIGHTNING, _parser, main
 from nlt.data import generate as generation
 from nlt.data.spec import load_spec
-from nlt.evaluation.comparison import Comparison, build_if_untrained
+from nlt.evaluation.comparison import Comparison
 from nlt.metrics import quantities
 from nlt.paths import PROJECT, find_config
 from nlt.rendering.renderer import Renderer
@@ -129,9 +129,7 @@ def parse(command):
         scenes = load_spec(options.config)[0].scenes
     elif name in ("compare", "stress"):
         comparison = Comparison.load(options.config, options.scale, options.data, options.methods)
-        trained = [method for method in comparison.methods if not build_if_untrained(method)]
-        for method in trained if options.methods else trained[-1:]:
-            _taken(tuple(comparison.configs(method)))
+        assert comparison.configs
         assert name == "compare" or load_suites(options.manifest)
     elif name == "select":
         assert SearchSpace.load(options.config, options.minutes).methods

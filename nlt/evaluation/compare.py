@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from nlt.config import read_configs
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Died
 from nlt.data.generate import generate
-from nlt.data.spec import load_spec
 from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation import live
 from nlt.evaluation.clock import Clock
-from nlt.evaluation.comparison import Comparison, build_if_untrained
+from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.provenance import origin, surroundings
@@ -36,7 +34,7 @@ from nlt.evaluation.results import (
     write_rows,
     write_timings,
 )
-from nlt.evaluation.trainings import Training, check, train
+from nlt.evaluation.trainings import Training, train
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
@@ -66,45 +64,36 @@ def compare(
         UserError: a config, an option or the dataset is wrong, or the disk is full.
     """
     start, provenance = time.time(), origin()
-    directory = Path(out or Path("results") / comparison.name)
-    spec, root = load_spec([str(comparison.data), str(comparison.scale)])
-    if not spec.test:
-        raise UserError(f"{comparison.scale}: data.dataset.test: must be at least 1 for a comparison, is 0")
+    directory, spec = Path(out or Path("results") / comparison.name), comparison.spec
     for count in train_images:
         if count > spec.train:
             raise UserError(f"--train-images: {count} is more than data.dataset.train; give at most {spec.train}")
-    jobs = comparison.jobs()
-    check(comparison)
-    dataset = generate(spec, root, workers, scheduler, slurm)
+    dataset = generate(spec, comparison.root, workers, scheduler, slurm)
+    root = Path("runs") / dataset.name
     trainings = {
-        (*job, count): Training.of(comparison, *job, Path("runs") / dataset.name, count)
+        (method, seed, count): Training.of(comparison, method, seed, root, count)
         for count in (None, *sorted({*train_images} - {spec.train}))
-        for job in jobs
-        if not build_if_untrained(job[0])
+        for method, seed in comparison.jobs
+        if method in comparison.trained
     }
     failures = train(list(trainings.values()), scheduler, workers, slurm or {})
-    if history := _history(trainings.values()):
+    if history := [row for key, training in trainings.items() if key[2] is None for row in _history(training)]:
         write_rows(directory / HISTORY, history)
     device = default_device()
     policy = Policy.for_device(device, comparison.precision)
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
     test, clock = Evaluation(frames, device, policy), Clock(frames, device, policy=policy)
     test.write_references(directory)
-    record = {
-        **provenance,
-        **surroundings(device, policy),
-        **_describe_comparison(comparison, test),
-        "train_images": sorted(train_images),
-        **_describe_references(test),
-    }
+    record = {**provenance, **surroundings(device, policy), **_describe(comparison, test, train_images)}
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
-    for number, (method, seed) in enumerate(jobs, 1):
-        print(f"\n[{number}/{len(jobs)}] {method}, seed {seed}", flush=True)
+    for number, (method, seed) in enumerate(comparison.jobs, 1):
+        print(f"\n[{number}/{len(comparison.jobs)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed}
         with _record_failure(run):
-            module, facts, folder = build_if_untrained(method), dict[str, Any](), Path("runs") / dataset.name / method
-            if module is None:
+            if method in comparison.untrained:
+                module, facts, folder = comparison.untrained[method], dict[str, Any](), root / method
+            else:
                 training = trainings[method, seed, None]
                 (module, facts), folder = _load_trained(training, failures, device), training.run
             key = _evaluation_cache_key(record, method, facts)
@@ -125,25 +114,31 @@ def compare(
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         after_row(directory)
     print("\n" + "\n".join([live.header(), *(live.row(run) for run in runs), live.floor(record["floor"])]))
-    # The curve also has the trainings on all images.
-    full_trainings = [
-        {**run, "train_images": spec.train} for run in runs if train_images and not build_if_untrained(run["method"])
-    ]
-    rows = [{key: run[key] for key in (*_ROW, *METRICS) if key in run} for run in full_trainings]
-    rows += [
-        _fewer_images_row(training, failures, test, record) for training in trainings.values() if training.train_images
-    ]
-    if rows:
-        write_rows(directory / TRAINING_IMAGES, rows)
+    if train_images and comparison.trained:
+        # The curve also has the trainings on all images.
+        rows = [run | {"train_images": spec.train} for run in runs if run["method"] in comparison.trained]
+        for (method, seed, images), training in trainings.items():
+            if images:
+                row: dict[str, Any] = {"method": method, "seed": seed, "train_images": images}
+                with _record_failure(row):
+                    module, facts = _load_trained(training, failures, device)
+                    key = _evaluation_cache_key(record, method, facts)
+                    row |= test.evaluate_once(module, training.run / JUDGED, key)[0]
+                print(f"{training.name}: {row['status']} {row['message']}", flush=True)
+                rows.append(row)
+        columns = (*_ROW, *METRICS)
+        write_rows(directory / TRAINING_IMAGES, [{key: row[key] for key in columns if key in row} for row in rows])
     return directory
 
 
-def _describe_comparison(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
-    """Return the manifest's entries on what is compared and on which data."""
+def _describe(comparison: Comparison, test: Evaluation, train_images: Sequence[int]) -> dict[str, Any]:
+    """Return the manifest's entries on what is compared, on which data, and how accurate the references are."""
+    floor, measured = test.floor()
+    scenes = zip(measured.items(), references(test.directory, test.spec), strict=True)
     return {
         "comparison": comparison.name,
         "table": comparison.table,
-        "variant": comparison.variant and comparison.variant.stem,
+        "variant": comparison.variant,
         "methods": comparison.methods,
         "seeds": comparison.seeds,
         "dataset": test.directory.name,
@@ -151,29 +146,11 @@ def _describe_comparison(comparison: Comparison, test: Evaluation) -> dict[str, 
         "integrators": test.frames.integrators(),
         "n_test": len(test),
         "shown": test.shown,
-        "configs": {method: read_configs(comparison.configs(method)) for method in comparison.methods},
+        "configs": comparison.configs,
+        "train_images": sorted(train_images),
+        "floor": floor,
+        "references": {scene: {**entry, "measured_mse": mse} for (scene, mse), entry in scenes},
     }
-
-
-def _describe_references(test: Evaluation) -> dict[str, Any]:
-    """Return the manifest's entries on the accuracy of the references."""
-    floor, measured = test.floor()
-    scenes = zip(measured.items(), references(test.directory, test.spec), strict=True)
-    return {"floor": floor, "references": {scene: {**entry, "measured_mse": mse} for (scene, mse), entry in scenes}}
-
-
-def _fewer_images_row(
-    training: Training, failures: Mapping[Training, str], test: Evaluation, record: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Evaluate a training on fewer images and return its row of training_images.csv."""
-    row: dict[str, Any] = {"method": training.method, "seed": training.seed, "train_images": training.train_images}
-    with _record_failure(row):
-        module, facts = _load_trained(training, failures, test.device)
-        row |= test.evaluate_once(module, training.run / JUDGED, _evaluation_cache_key(record, training.method, facts))[
-            0
-        ]
-    print(f"{training.name}: {row['status']} {row['message']}", flush=True)
-    return row
 
 
 def _evaluation_cache_key(record: Mapping[str, Any], method: str, facts: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -206,11 +183,8 @@ def _load_trained(
     return training.load(device)
 
 
-def _history(trainings: Iterable[Training]) -> list[dict[str, Any]]:
-    """Return the rows of history.csv."""
+def _history(training: Training) -> list[dict[str, Any]]:
+    """Return a training's rows of history.csv."""
     return [
-        {"method": training.method, "seed": training.seed, **row}
-        for training in trainings
-        if not training.train_images
-        for row in (training.took or {}).get("history", [])
+        {"method": training.method, "seed": training.seed, **row} for row in (training.outcome or {}).get("history", [])
     ]

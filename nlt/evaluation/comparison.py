@@ -1,19 +1,25 @@
-"""A comparison as a config of configs/compare describes it: methods, seeds, data, scale."""
+"""A comparison: the dataset, the methods and their configs, as a config of configs/compare names them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from pydantic import NonNegativeInt, field_validator
 
 from nlt.config import Settings, parse, read_configs
+from nlt.data.files import AnyPath
+from nlt.data.spec import DatasetSpec, load_spec
+from nlt.errors import UserError
 from nlt.evaluation.paper import order, tables
 from nlt.models.factory import build, method_class
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
+from nlt.training import check_configs
 
 
 class _Content(Settings):
@@ -55,19 +61,23 @@ def _known(kind: str, name: str | None, names: Collection[str]) -> str | None:
 
 @dataclass
 class Comparison:
-    """A comparison as a config of configs/compare describes it.
+    """A comparison, read from its config once.
 
-    `variant` is a config of configs/variant that changes every trained method; METHOD@VARIANT applies a further one to
-    a single method. `name` includes the scale and the data if they differ from the config's.
+    Attributes:
+        name: the config's name, with the scale and the data if they differ from the config's.
+        spec, root: the dataset and the directory of datasets.
+        files: the config files of each method, later ones overriding earlier ones. `variant` changes every trained
+            method; METHOD@VARIANT applies a further config of configs/variant to a single method.
     """
 
     name: str
-    data: Path
+    spec: DatasetSpec
+    root: AnyPath
+    files: dict[str, list[Path]]
+    seeds: list[int]
     scale: Path
-    variant: Path | None = None
+    variant: str | None = None
     table: str | None = None
-    methods: list[str] = field(default_factory=list)
-    seeds: list[int] = field(default_factory=lambda: [0])
     precision: str = "auto"
 
     @classmethod
@@ -83,7 +93,7 @@ class Comparison:
         """Read a config by name or path; the other arguments override it.
 
         Raises:
-            UserError: an unknown key, table, method or file.
+            UserError: an unknown key, table, method or file, or a setting that `nlt fit` would refuse.
         """
         file = find_config("compare", config)
         own = read_configs([file])
@@ -94,26 +104,46 @@ class Comparison:
             if value and find_config(key, value) != find_config(key, str(own.get(key))):
                 name = find_config(key, value).stem
                 full_name = name if name.startswith(f"{full_name}_") else f"{full_name}_{name}"
-        return cls(
-            name=full_name,
-            data=find_config("data", content.data),
-            scale=find_config("scale", content.scale),
-            variant=find_config("variant", content.variant) if content.variant else None,
-            table=content.table,
-            methods=sorted(content.methods or all_methods(), key=order),
-            seeds=list(range(content.seed, content.seed + seeds)),
-            precision=precision,
-        )
+        data_file, scale_file = find_config("data", content.data), find_config("scale", content.scale)
+        spec, root = load_spec([str(data_file), str(scale_file)])
+        if not spec.test:
+            raise UserError(f"{scale_file}: data.dataset.test: must be at least 1 for a comparison, is 0")
+        files = {}
+        for method in sorted(content.methods or all_methods(), key=order):
+            model, _, own_variant = method.partition("@")
+            variants = [find_config("variant", name) for name in (content.variant, own_variant) if name]
+            files[method] = [data_file, find_config("model", model), scale_file, *variants]
+        seed_list = list(range(content.seed, content.seed + seeds))
+        found = cls(full_name, spec, root, files, seed_list, scale_file, content.variant, content.table, precision)
+        for method in found.trained:
+            check_configs([str(path) for path in files[method]])
+        return found
 
+    @property
+    def methods(self) -> list[str]:
+        """The methods in the order of the tables."""
+        return list(self.files)
+
+    @cached_property
+    def configs(self) -> dict[str, dict[str, Any]]:
+        """The merged config of each method."""
+        return {method: read_configs(files) for method, files in self.files.items()}
+
+    @cached_property
+    def untrained(self) -> dict[str, Method]:
+        """The methods that need no training."""
+        built = {method: build_if_untrained(method) for method in self.methods}
+        return {method: renderer for method, renderer in built.items() if renderer}
+
+    @property
+    def trained(self) -> list[str]:
+        """The names of the methods that need training."""
+        return [method for method in self.methods if method not in self.untrained]
+
+    @property
     def jobs(self) -> list[tuple[str, int]]:
-        """Return the rows of the comparison as (method, seed); methods without training have one seed."""
-        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if build_if_untrained(m) else self.seeds)]
-
-    def configs(self, method: str) -> list[str]:
-        """Return the config files of a method's training, later ones overriding earlier ones."""
-        name, _, variant = method.partition("@")
-        variants = [self.variant, find_config("variant", variant) if variant else None]
-        return [str(path) for path in (self.data, find_config("model", name), self.scale, *filter(None, variants))]
+        """The rows of the comparison as (method, seed); methods without training have one seed."""
+        return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if m in self.untrained else self.seeds)]
 
 
 def all_methods() -> list[str]:

@@ -16,35 +16,31 @@ import lightning as L
 import torch
 import yaml
 
-from nlt.config import merge, read_configs
+from nlt.config import merge
 from nlt.data.engines import find_engine
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError, UserError, to_user_error
-from nlt.evaluation.comparison import Comparison, build_if_untrained
+from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
 from nlt.evaluation.provenance import origin
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
-from nlt.training import check_configs, newest_checkpoint, run_lightning
+from nlt.training import newest_checkpoint, run_lightning
 
 
 @dataclass(frozen=True)
 class Training:
     """A job: a method's training with a seed, on all training images or the first `train_images` of each scene.
 
-    `changes` is a config in JSON that overrides the `files`.
-
     The name of its directory `run` has a hash of all that determines the outcome, so a method is trained again only
-    when that changes. The directory holds checkpoints, log, progress and, after the end, the outcome.
+    when that changes. The directory holds checkpoints, log, progress and, after the end, the outcome. `config` is JSON.
     """
 
     method: str
     seed: int
     run: Path
-    files: tuple[str, ...]
-    precision: str
+    config: str
     train_images: int | None = None
-    changes: str = "{}"
 
     @classmethod
     def of(
@@ -57,18 +53,18 @@ class Training:
         changes: Mapping[str, Any] | None = None,
     ) -> Training:
         """Create a comparison's training, with a directory below `root`."""
-        files, changes = comparison.configs(method), changes or {}
+        config = merge(comparison.configs[method], changes or {})
         if train_images:
-            changes = merge(changes, {"data": {"train_images": train_images}})
-        merged = merge(read_configs(files), changes)
+            config = merge(config, {"data": {"train_images": train_images}})
         # A method that was trained on another device, in that device's precision, is not trained again on this one.
         choices = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
         precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in choices)
-        runs = {precision: root / f"{method}-{_config_hash(merged, seed, precision)}" for precision in precisions}
+        runs = {precision: root / f"{method}-{_config_hash(config, seed, precision)}" for precision in precisions}
         precision = next((p for p, run in runs.items() if (run / DONE).exists()), next(iter(runs)))
-        # Absolute, because processes on other machines have other working directories.
-        paths = tuple(os.path.abspath(file) for file in files)
-        return cls(method, seed, runs[precision].absolute(), paths, precision, train_images, json.dumps(changes))
+        # The precision is fixed here, because the machine that trains might choose another one than the hash's.
+        config = merge({"trainer": {"precision": precision}}, config)
+        # An absolute path, because processes on other machines have other working directories.
+        return cls(method, seed, runs[precision].absolute(), json.dumps(config), train_images)
 
     @property
     def name(self) -> str:
@@ -77,11 +73,11 @@ class Training:
         return f"{self.method}, seed {self.seed}{images}"
 
     @property
-    def took(self) -> dict[str, Any] | None:
-        """The outcome: time, steps and `history` (progress.py), or how it diverged; None before the end."""
+    def outcome(self) -> dict[str, Any] | None:
+        """Time, steps and `history` (progress.py), or how it diverged; None before the end."""
         done = self.run / DONE
-        outcome = json.loads(done.read_text()) if done.exists() else None
-        return outcome if outcome and ("diverged" in outcome or newest_checkpoint(self.run)) else None
+        content = json.loads(done.read_text()) if done.exists() else None
+        return content if content and ("diverged" in content or newest_checkpoint(self.run)) else None
 
     def load(self, device: torch.device) -> tuple[RenderingModule, dict[str, Any]]:
         """Load the trained method and the facts about its training, without `history`.
@@ -89,24 +85,13 @@ class Training:
         Raises:
             DivergedError: the training diverged, now or in an earlier comparison.
         """
-        outcome, checkpoint = self.took or {}, newest_checkpoint(self.run)
+        outcome, checkpoint = self.outcome or {}, newest_checkpoint(self.run)
         outcome.pop("history", None)
         if "diverged" in outcome:
             raise DivergedError(outcome["diverged"])
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval()
         return module, outcome | {"run": os.path.relpath(self.run)}
-
-
-def check(comparison: Comparison) -> None:
-    """Check the configs of all methods, before the first is trained.
-
-    Raises:
-        UserError: a config is wrong.
-    """
-    for method in comparison.methods:
-        if not build_if_untrained(method):
-            check_configs(comparison.configs(method))
 
 
 def train(
@@ -120,7 +105,7 @@ def train(
     Raises:
         UserError: a config or the dataset is wrong, or the disk is full.
     """
-    unfinished = [training for training in trainings if not training.took]
+    unfinished = [training for training in trainings if not training.outcome]
     failures: dict[Training, str] = {}
     if not unfinished:
         return failures
@@ -132,7 +117,7 @@ def train(
             table.show({t.run: reason for t, reason in failures.items()})
     table.show({t.run: reason for t, reason in failures.items()}, last=True)
     for training in unfinished:
-        if training not in failures and not training.took:
+        if training not in failures and not training.outcome:
             raise UserError(f"{training.run}: {DONE} is missing; use a directory that all machines share")
     return {training: table.rows[training.run].message for training in failures}
 
@@ -146,7 +131,7 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
             os.dup2(log.fileno(), stream)
         with suppress(OSError):  # some file systems have no locks
             fcntl.flock(lock, fcntl.LOCK_EX)  # wait for a job that a killed comparison left in a queue
-        if training.took:
+        if training.outcome:
             return
         torch.set_num_threads(threads)
         progress = Progress(run, tick)
@@ -172,11 +157,8 @@ def _config_hash(config: dict[str, Any], seed: int, precision: str) -> str:
 
 def _fit(training: Training, progress: Progress) -> dict[str, Any]:
     """Run a job's training and return the facts about it."""
-    config = merge(read_configs(training.files), json.loads(training.changes))
-    # Set here, because another machine might choose another precision than the one in the directory's hash.
-    config = merge({"trainer": {"precision": training.precision}}, config)
     resumed = newest_checkpoint(training.run) is not None
-    trainer = fit(training.run, config, training.seed, [progress])
+    trainer = fit(training.run, json.loads(training.config), training.seed, [progress])
     return {
         "train_s": progress.seconds,
         "steps": trainer.global_step,

@@ -18,13 +18,13 @@ import numpy as np
 from tqdm import tqdm
 
 from nlt.data.generate import generate
-from nlt.data.spec import DatasetSpec, load_spec
+from nlt.data.spec import DatasetSpec
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.claims import write_claims
-from nlt.evaluation.comparison import Comparison, build_if_untrained
+from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
-from nlt.evaluation.trainings import Training, check, train
+from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.report.page import write_page
@@ -68,16 +68,13 @@ def stress(
     start, begun = time.time(), origin()
     comparison, content = Comparison.load(config, scale, data, methods), load_suites(manifest, views)
     wanted = suites or list(SUITES)
-    spec, root = load_spec([str(comparison.data), str(comparison.scale)])
-    if not spec.test:
-        raise UserError(f"{comparison.scale}: data.dataset.test: must be at least 1: the suites change test samples")
-    check(comparison)
+    spec = comparison.spec
     _check_changes(content)
-    dataset = generate(spec, root)
-    runs, trained = Path("runs") / dataset.name, [m for m in comparison.methods if not build_if_untrained(m)]
-    trainings = {name: Training.of(comparison, name, comparison.seeds[0], runs) for name in trained}
+    dataset = generate(spec, comparison.root)
+    runs = Path("runs") / dataset.name
+    trainings = {name: Training.of(comparison, name, comparison.seeds[0], runs) for name in comparison.trained}
     failures = train(list(trainings.values()), "local", None, {})
-    sets, rendered = view_sets(spec, content, wanted), content.directory(spec, root)
+    sets, rendered = view_sets(spec, content, wanted), content.directory(spec, comparison.root)
     render_suites(spec, dataset, content, sets, rendered)
     device = default_device()
     policy = Policy.for_device(device, comparison.precision)
@@ -101,7 +98,7 @@ def stress(
             try:
                 if name in trainings and trainings[name] in failures:
                     raise DivergedError(failures[trainings[name]])
-                method = build_if_untrained(name) or trainings[name].load(device)[0]
+                method = comparison.untrained.get(name) or trainings[name].load(device)[0]
             except DivergedError as problem:
                 record["left_out"].append(f"{name}: {problem}")
                 bar.write(f"left out: {record['left_out'][-1]}")

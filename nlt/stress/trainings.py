@@ -13,7 +13,7 @@ import torch
 from nlt.config import merge, read_configs
 from nlt.data.engines import available_cpus
 from nlt.errors import DivergedError, UserError
-from nlt.evaluation.comparison import Comparison, build_if_untrained
+from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
@@ -53,7 +53,7 @@ def train_suite(
     known = {row["run"]: row["error"] for row in finished}
     jobs: list[tuple[dict[str, Any], Training]] = []
     for method in _one_per_kind(comparison):
-        config = read_configs(comparison.configs(method))
+        config = comparison.configs[method]
         for variation, value, seed, changes in _variations(config, content, comparison):
             training = Training.of(comparison, method, seed, runs / STRESS, changes=changes)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
@@ -75,12 +75,10 @@ def train_suite(
 def _one_per_kind(comparison: Comparison) -> list[str]:
     """Return the first trained method of each class and set of inputs."""
     first_of_kind: dict[str, str] = {}
-    for method in comparison.methods:
-        if not build_if_untrained(method):
-            model = read_configs([comparison.configs(method)[1]])["model"]
-            init_args = model.get("init_args", {})
-            inputs = {name: value for name, value in init_args.items() if type(value) is not int}
-            first_of_kind.setdefault(f"{model['class_path']} {inputs}", method)
+    for method in comparison.trained:
+        model = read_configs([comparison.files[method][1]])["model"]
+        inputs = {name: value for name, value in model.get("init_args", {}).items() if type(value) is not int}
+        first_of_kind.setdefault(f"{model['class_path']} {inputs}", method)
     return list(first_of_kind.values())
 
 

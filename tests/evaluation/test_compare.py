@@ -375,7 +375,7 @@ def test_one_methods_config_retrains_this_method(world, trainings):
     file.write_text(before + "  init_args:\n    learning_rate: 0.01\n")
     try:
         rows = world.compare("--methods", "cnn", "feature_projection")
-        assert len(trainings) == 1 and str(file) in trainings[0].files
+        assert len(trainings) == 1 and '"learning_rate": 0.01' in trainings[0].config
         assert rows["feature_projection"]["mse"] != world.rows["feature_projection"]["mse"]
         assert rows["cnn"]["mse"] == world.rows["cnn"]["mse"]
     finally:
@@ -497,7 +497,7 @@ def trained_elsewhere(world, folder, scheduler):
     found = comparison.Comparison.load(str(world.config), None, None, ["cnn"])
     job = Training.of(found, "cnn", 3, folder)
     assert train([job], scheduler, 1, {}) == {}
-    return job.took["threads"] == 1 and same_weights(job.run, world.run("cnn"))
+    return job.outcome["threads"] == 1 and same_weights(job.run, world.run("cnn"))
 
 
 def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
@@ -607,7 +607,8 @@ def test_training_images(world, trainings, capfd):
     rows = load(world.folder / "fewer").rows("training_images.csv")
     assert [(row["method"], row["train_images"], row["status"]) for row in rows] == [("cnn", 8, "ok"), ("cnn", 3, "ok")]
     assert rows[0]["mse"] == float(world.rows["cnn"]["mse"]) != rows[1]["mse"] > 0
-    assert trainings[0].took["steps"] == STEPS and (world.folder / "fewer/table.csv").read_text().count("\ncnn,") == 1
+    assert trainings[0].outcome["steps"] == STEPS
+    assert (world.folder / "fewer/table.csv").read_text().count("\ncnn,") == 1
     assert main(["compare", "--config", str(world.config), "--methods", "cnn", "--train-images", "9"]) == 2
     assert "--train-images: 9 is more than data.dataset.train; give at most 8" in capfd.readouterr().err
 
@@ -874,4 +875,4 @@ def test_every_comparison_names_what_there_is(name):
     if found.table:
         assert {m for m in paths.config_names("model") if published(found.table, m)} <= set(found.methods)
     trained = [method for method in found.methods if comparison.build_if_untrained(method) is None]
-    assert len(found.jobs()) == 3 * len(trained) + len(found.methods) - len(trained)
+    assert len(found.jobs) == 3 * len(trained) + len(found.methods) - len(trained)
