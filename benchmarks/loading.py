@@ -29,6 +29,7 @@ from torch.utils.data import DataLoader, Dataset
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
+from nlt.data.files import write_bytes
 from nlt.data.sample import MATERIALS, POINT_FIELDS, Field
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name, write_manifest, write_shard
@@ -151,8 +152,7 @@ def main() -> None:
             report["methods"][method] = row
             print(method, ", ".join(f"{key} {value:,.4g}" for key, value in row.items()), flush=True)
             file.unlink()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(report, indent=1) + "\n")
+    write_bytes(options.out, (json.dumps(report, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,9 @@ Row = dict[str, Any]
 def write_report(directory: Path) -> None:
     """Write bench.md, bench.png and .svg, and growth.png and .svg if growth was measured."""
     content = json.loads((directory / BENCH).read_text())
-    parts: dict[str, list[Row]] = {"training": [], "growth": []}
+    parts = defaultdict(list)
     for part in content["parts"]:
-        parts.setdefault(part["kind"], []).append(part)
+        parts[part["kind"]].append(part)
     write_bytes(directory / "bench.md", _markdown(content["manifest"], parts).encode())
     _draw_frames(directory, parts["frame"])
     if parts["growth"]:
@@ -59,7 +60,7 @@ def _mib(row: Row) -> str:
     return f"{row['peak_memory_bytes'] / 2**20:.0f}" if "peak_memory_bytes" in row else "–"
 
 
-def _markdown(manifest: Row, parts: dict[str, list[Row]]) -> str:
+def _markdown(manifest: Row, parts: Mapping[str, list[Row]]) -> str:
     settings, size = manifest["settings"], manifest["settings"]["resolution"]
     before, after = manifest["load_average"]["before"], manifest["load_average"]["after"]
     (ceilings,), (generation,), (loading,) = (parts[kind] for kind in ("ceilings", "generation", "loading"))
@@ -140,12 +141,13 @@ def _ceilings(ceilings: Row, settings: Row) -> list[str]:
     copy = computing.pop("copy")
     table = [[name.replace("_", ", "), f"{value / 1e9:.0f} GFLOP/s"] for name, value in computing.items()]
     table.append(["copying memory, read and written", f"{copy / 1e9:.1f} GB/s"])
-    names = {"path_tracing": "at 1 spp", "gbuffer": "of depth, normal and albedo", "photons": ""}
-    size = settings["resolution"]
-    for name, seconds in ceilings["bare_s"].items():
-        bare = f"{settings['num_photons']:,} photons, bare"
-        title = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else bare
-        table.append([title, f"{1e3 * seconds:.2f} ms"])
+    size = f"{settings['resolution']}x{settings['resolution']}"
+    names = {
+        "path_tracing": f"`mi.render` at 1 spp, {size}",
+        "gbuffer": f"`mi.render` of depth, normal and albedo, {size}",
+        "photons": f"{settings['num_photons']:,} photons, bare",
+    }
+    table += [[names[name], f"{1e3 * seconds:.2f} ms"] for name, seconds in ceilings["bare_s"].items()]
     return ["## This machine's ceilings, in the same run", "", *grid(["", "best"], table)]
 
 
