@@ -16,7 +16,7 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -34,10 +34,11 @@ from nlt.rendering.variant import choose_variant, use_variant
 from nlt.report import plots
 from nlt.report.table_writer import grid
 from nlt.scenes.assembly import Scene
-from nlt.scenes.description import EXPERIMENTS, INTEGRATORS, load_description
+from nlt.scenes.description import EXPERIMENTS, Integrator, load_description
 from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
+INTEGRATORS: tuple[str, ...] = get_args(Integrator)
 SPP = 16  # samples per pixel of a render
 LEAST = 8  # least number of renders of every view
 BLOCK = 4  # width in pixels of the blocks whose agreement is tested

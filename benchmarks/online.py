@@ -94,7 +94,7 @@ def train(config: Row, spec: DatasetSpec, root: Path, size: int | None, seed: in
 
 def build(config: Row, spec: DatasetSpec, seed: int) -> RenderingModule:
     sizes = {"num_scenes": len(spec.scenes), "num_points": spec.num_points}
-    module = factory.build(config, "the config", lr_decay=1.0, seed=seed, **sizes)
+    module = factory.build(config, "the config", lr_schedule="paper", lr_decay=1.0, seed=seed, **sizes)
     assert isinstance(module, RenderingModule)
     return module
 

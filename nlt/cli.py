@@ -19,9 +19,6 @@ _LIGHTNING = {
     "predict": "write the images that a checkpoint predicts for the test split",
 }
 
-# Commands in which Mitsuba and PyTorch alternate within a frame.
-_FRAMES = ("compare", "render")
-
 # Help texts of several commands.
 _IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
@@ -74,7 +71,7 @@ def _run(arguments: list[str]) -> None:
             print(f"written to {trainer.log_dir}")
         return
     options = _parser().parse_args(arguments)
-    if options.command in _FRAMES:
+    if options.command in ("compare", "render"):  # Mitsuba and PyTorch alternate within a frame
         wait_passively()
     if options.command == "generate":
         from nlt.data.generate import generate

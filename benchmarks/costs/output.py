@@ -16,7 +16,7 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label
 from nlt.metrics.quantities import STAGES
 from nlt.report import plots
-from nlt.report.table_writer import grid
+from nlt.report.table_writer import Table, grid, section
 
 BENCH = "bench.json"
 _COLOUR = dict(zip(STAGES, (*plots.COLOURS[:6], "#999999"), strict=True))
@@ -133,7 +133,7 @@ def _training(rows: list[Row]) -> list[str]:
             f"{row['images_per_second']:.2f}", _ms_p95(row, "step"), f"{row['waiting_share']:.1%}",
         ]  # fmt: skip
         table.append([label(row["method"]), *cells])
-    return ["## Training", "", *grid(["method", "images per second", "step (ms)", "waiting for data"], table)]
+    return section(Table("Training", "", ["images per second", "step (ms)", "waiting for data"], table))
 
 
 def _ceilings(ceilings: Row, settings: Row) -> list[str]:
@@ -148,7 +148,7 @@ def _ceilings(ceilings: Row, settings: Row) -> list[str]:
         "photons": f"{settings['num_photons']:,} photons, bare",
     }
     table += [[names[name], f"{1e3 * seconds:.2f} ms"] for name, seconds in ceilings["bare_s"].items()]
-    return ["## This machine's ceilings, in the same run", "", *grid(["", "best"], table)]
+    return section(Table("This machine's ceilings, in the same run", "", ["best"], table, first=""))
 
 
 def _growth(rows: list[Row]) -> list[str]:
@@ -159,13 +159,8 @@ def _growth(rows: list[Row]) -> list[str]:
         name = f"{label(row['method'])}, {row['factor']} {row['value']:,}"
         whole = row.get("skipped") or _ms_p95(row, "time_per_frame")
         table.append([name, *(_ms(row, stage) for stage in stages), whole, _mib(row)])
-    return [
-        "## Growth",
-        "",
-        "Median milliseconds with one setting changed at a time; with a larger batch, those of all its frames.",
-        "",
-        *grid(["", *_names(stages), "frame", "peak MiB"], table),
-    ]
+    note = "Median milliseconds with one setting changed at a time; with a larger batch, those of all its frames."
+    return section(Table("Growth", note, [*_names(stages), "frame", "peak MiB"], table, first=""))
 
 
 def _draw_frames(directory: Path, rows: list[Row]) -> None:

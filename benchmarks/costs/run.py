@@ -323,9 +323,9 @@ class Benchmark:
         precision = {**trainer_defaults(), **self.config.get("trainer", {})}.get("precision")
         quiet()
         trainer = L.Trainer(
-            max_epochs=-1, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1, callbacks=[steps],
-            logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
-            use_distributed_sampler=False, limit_val_batches=0, precision=precision,
+            max_steps=1 + _TRAINING_STEPS, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1,
+            callbacks=[steps], logger=False, enable_checkpointing=False, enable_progress_bar=False,
+            enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, precision=precision,
         )  # fmt: skip
         trainer.fit(method.train(), datamodule=data)
         whole = [a + b for a, b in zip(steps.waited, steps.computed, strict=True)]
@@ -396,8 +396,7 @@ class _Steps(L.Callback):
             self.waited.append(self.start - self.end)
             self.computed.append(now - self.start)
         self.end = now
-        steps = len(self.waited)
-        trainer.should_stop = steps >= _TRAINING_STEPS or (steps > 0 and now - self.begin > self.seconds)
+        trainer.should_stop = bool(self.waited) and now - self.begin > self.seconds
 
 
 def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:

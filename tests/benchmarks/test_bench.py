@@ -13,6 +13,7 @@ from costs.plain import plain
 from synthetic import POINTS, SCENES, synthetic_batch
 from tiny import DATASET, SCALE, write
 
+from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.evaluation import clock
@@ -104,7 +105,7 @@ def arguments(tmp_path_factory):
     """Yield the arguments of a benchmark that takes seconds."""
     folder = tmp_path_factory.mktemp("bench")
     data = write(folder / "data.yaml", {"data": {"dataset": DATASET, "batch_size": 2, "workers": 0}})
-    scale = write(folder / "scale.yaml", SCALE)
+    scale = write(folder / "scale.yaml", merge(SCALE, {"model": {"init_args": {"lr_schedule": "cosine"}}}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench, "GRID", GRID)
         patch.setattr(bench, "_TRAINING_STEPS", 3)
