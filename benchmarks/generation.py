@@ -29,14 +29,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch
+from costs.bare import Bare
 
-from nlt.bench.bare import Bare
 from nlt.data.engines import Process, available_cpus
+from nlt.data.files import write_bytes
 from nlt.data.generate import generate, render_shard
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, Shard
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.paths import PROJECT
+from nlt.report.table_writer import grid
 from nlt.scenes.assembly import load_source
 from nlt.scenes.description import MOVING_LIGHT
 
@@ -132,15 +134,8 @@ def main() -> None:
     options = parser.parse_args()
     manifest = origin()
     count = options.shard * (options.rounds + 1)
-    spec = DatasetSpec(
-        [options.scene],
-        options.experiment,
-        options.resolution,
-        train=count,
-        val=0,
-        test=count,
-        shard_size=options.shard,
-    )
+    sizes = {"train": count, "val": 0, "test": count, "shard_size": options.shard}
+    spec = DatasetSpec([options.scene], options.experiment, options.resolution, **sizes)
     manifest |= surroundings(torch.device("cpu"))
     barrier = multiprocessing.get_context("spawn").Barrier(options.workers)
     with tempfile.TemporaryDirectory() as folder:
@@ -172,10 +167,9 @@ def main() -> None:
         "turns": [result["seconds"] for result in results],
         "manifest": manifest,
     }
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "generation.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_bytes(options.out / "generation.json", (json.dumps(report, indent=1) + "\n").encode())
     text = markdown(report)
-    (options.out / "generation.md").write_text(text)
+    write_bytes(options.out / "generation.md", text.encode())
     print(text)
 
 
@@ -184,19 +178,14 @@ def markdown(report: dict[str, Any]) -> str:
     rate = lambda split, who: f"{rates[f'{split} {who}']:.2f}"
     ratio = lambda split, who: f"{report['ratio'][f'{split} {who}']:.2f}"
     names = ("generation", "bare", "frozen")
-    rows = [
-        f"| {' | '.join([s, *(rate(s, who) for who in names), ratio(s, 'bare'), ratio(s, 'frozen')])} |" for s in SPLITS
-    ]
+    rows = [[s, *(rate(s, who) for who in names), ratio(s, "bare"), ratio(s, "frozen")] for s in SPLITS]
+    contestants = ("generation", "bare loop of mi.render", "the same under dr.freeze")
     whole, compiled = report["end_to_end"], report["kernels_compiled_after_the_first_turn"]
     return "\n".join([
         f"Generation of {options['scene']}, {options['experiment']}, {options['resolution']}x{options['resolution']}, "
         f"{options['workers']} processes; {report['manifest']['device']}, {report['manifest']['mitsuba_variant']}.",
         "",
-        "| samples per second | generation | bare loop of mi.render | the same under dr.freeze | ratio to bare "
-        "| ratio to frozen |",
-        "|---|---:|---:|---:|---:|---:|",
-        *rows,
-        "",
+        *grid(["samples per second", *contestants, "ratio to bare", "ratio to frozen"], rows),
         f"Whole command, including startup: {whole['samples']} training samples in {whole['seconds']:.1f} s, "
         f"{whole['samples_per_second']:.2f} per second. Kernels compiled after the first turn: generation "
         f"{compiled['generation']}, bare loop {compiled['bare']}, frozen {compiled['frozen']}. "

@@ -16,33 +16,35 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from scipy import stats
 
+from nlt.cli import exit_code
 from nlt.data.engines import Process
 from nlt.data.files import write_bytes
 from nlt.display import display
-from nlt.errors import UserError
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
-from nlt.report.figures import plt
+from nlt.report import plots
+from nlt.report.table_writer import grid
 from nlt.scenes.assembly import Scene
-from nlt.scenes.description import EXPERIMENTS, INTEGRATORS, load_description
+from nlt.scenes.description import EXPERIMENTS, Integrator, load_description
 from nlt.scenes.state import sample_state
 from nlt.scenes.views import Views
 
+INTEGRATORS: tuple[str, ...] = get_args(Integrator)
 SPP = 16  # samples per pixel of a render
 LEAST = 8  # least number of renders of every view
 BLOCK = 4  # width in pixels of the blocks whose agreement is tested
 RESAMPLES = 1000
 ACROSS = 4  # panels in a row
 UNSURE = 0.1  # share of the variance in one pixel above which the table warns
-COLOURS = {"path": "#0072B2", "bdpt": "#D55E00"}
 
 
 def main() -> None:
@@ -67,7 +69,7 @@ def main() -> None:
         print(line(rows[-1]), flush=True)
         write_rows(options.out / "table.csv", rows)
         write_bytes(options.out / "table.md", markdown(rows).encode())
-    draw(options.out / "integrators.png", rows)
+    draw(options.out, rows)
     settings = {"scenes" if key == "names" else key: value for key, value in vars(options).items() if key != "out"}
     write_manifest(options.out, {**begun, **surroundings(torch.device("cpu")), **settings, "spp": SPP})
 
@@ -181,9 +183,9 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         "brackets, decides. Displayed: the ratio after the display transform, which clips fireflies. !: one pixel",
         f"makes up more than {UNSURE:.0%} of the variance: its estimate is unreliable. p: of a test that both agree.",
         "",
-        "| scene | path: µs | variance | bdpt: µs | variance | ratio at equal time | displayed | p | better |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---|",
     ]
+    headings = ["scene", "path: µs", "variance", "bdpt: µs", "variance", "ratio at equal time", "displayed", "p"]
+    table = []
     for row in rows:
         cells = [f"{row['scene']} ({row['experiment'].replace('_', ' ')})"]
         for integrator in INTEGRATORS:
@@ -191,11 +193,12 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             cells += [f"{1e6 * row[f'{integrator}_s']:.2f}", f"{row[f'{integrator}_variance']:.3g}{unsure}"]
         cells.append(f"{row['ratio']:.2f} ({row['ratio_low']:.2f} to {row['ratio_high']:.2f})")
         cells += [f"{row['display_ratio']:.2f}", f"{row['p_agreement']:.2g}", row["better"]]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", "Where the numbers come from: manifest.json."]) + "\n"
+        table.append(cells)
+    lines += [*grid([*headings, "better"], table), "Where the numbers come from: manifest.json.", ""]
+    return "\n".join(lines)
 
 
-def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+def draw(directory: Path, rows: list[dict[str, Any]]) -> None:
     """Plot variance over time, one panel per scene; the samples per pixel grow along a line."""
     across = min(ACROSS, len(rows))
     down = -(-len(rows) // across)
@@ -204,24 +207,19 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
     for axis in axes.flat[len(rows) :]:
         axis.set_axis_off()
     for axis, row in zip(axes.flat, rows, strict=False):
-        for integrator, marker in zip(INTEGRATORS, "os", strict=True):
+        for number, integrator in enumerate(INTEGRATORS):
             x, y = row[f"{integrator}_s"] * spp * 1e6, row[f"{integrator}_variance"] / spp
-            axis.plot(x, y, f"{marker}-", color=COLOURS[integrator], label=integrator)
+            axis.plot(x, y, **plots.style(number), label=integrator)
             axis.annotate("1 spp", (x[0], y[0]), (5, 4), textcoords="offset points", fontsize=7, color="0.3")
         axis.set(xscale="log", yscale="log", xlabel="time per pixel (µs)")
         interval = f"{row['ratio']:.2g} ({row['ratio_low']:.2g} to {row['ratio_high']:.2g})"
-        axis.set_title(f"{row['scene']}\nat equal time {interval}", fontsize=9)
-        axis.grid(alpha=0.3)
+        axis.set_title(f"{row['scene']}\nat equal time {interval}")
     for axis in axes[:, 0]:
         axis.set_ylabel("variance of radiance")
-    axes[0][0].legend(fontsize=8)
+    axes[0][0].legend()
     figure.tight_layout()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    plots.save(figure, directory, "integrators", ("png",))
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(exit_code(main))

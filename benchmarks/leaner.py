@@ -19,12 +19,14 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-import nlt.cli
+from nlt.cli import exit_code
+from nlt.cli import main as nlt
 from nlt.data.files import write_bytes
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import LEVEL, Results, load
 from nlt.metrics.quantities import METRICS
+from nlt.report.table_writer import grid
 
 STUDIES = {  # directory of the results: arguments of nlt compare
     "results/photon_splat_living_room": "--config photon_splat",
@@ -95,14 +97,14 @@ def judge(directory: Path) -> str:
             lines += [
                 f"**{metric.label}: {named(leanest)}.** The best is {named(best)}. "
                 f"A loss below {noise:.0%} may be the noise of {seeds} seeds.",
-                "", f"| method | {metric.label} | loss | beyond noise | time per frame (ms) | parameters |",
-                "|---|---:|---:|---|---:|---:|",
+                "",
+            ]
+            table = [
+                [label(row.method), f"{row.value:{metric.format}}", f"{row.loss:.0%}", "no" if row.enough else "yes",
+                 f"{1e3 * row.time:.1f}", f"{row.parameters:,}"] for row in rows
             ]  # fmt: skip
-            lines += [
-                f"| {label(row.method)} | {row.value:{metric.format}} | {row.loss:.0%} | "
-                f"{'no' if row.enough else 'yes'} | {1e3 * row.time:.1f} | {row.parameters:,} |" for row in rows
-            ]  # fmt: skip
-            lines.append("")
+            headings = ["method", metric.label, "loss", "beyond noise", "time per frame (ms)", "parameters"]
+            lines += grid(headings, table)
     lines += ["Loss: the fraction by which the error (1 - MSSIM for MSSIM) exceeds the best. Means over seeds.",
               f"`python benchmarks/leaner.py --judge {directory}`"]  # fmt: skip
     text = "\n".join(lines) + "\n"
@@ -121,13 +123,10 @@ def main() -> None:
         if not options.judge:
             more = [f"--seeds={options.seeds}", f"--workers={options.workers}", f"--out={directory}"]
             sys.argv = ["nlt", "compare", *STUDIES[directory].split(), *more]  # the manifest records it
-            if code := nlt.cli.main(sys.argv[1:]):
+            if code := nlt(sys.argv[1:]):
                 sys.exit(code)
         print(judge(Path(directory)), flush=True)
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(exit_code(main))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import tempfile
 import time
@@ -29,6 +28,7 @@ from torch.utils.data import DataLoader, Dataset
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
+from nlt.data.files import write_bytes
 from nlt.data.sample import MATERIALS, POINT_FIELDS, Field
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name, write_manifest, write_shard
@@ -100,10 +100,9 @@ def cpu_ms(dataset: LightTransportDataset, batch: int) -> float:
     """Return the least processor time of a sample in ms, read in batches in this process."""
     times = []
     for start in range(0, len(dataset) - batch + 1, batch):
-        before = os.times()
+        before = time.process_time()
         dataset.__getitems__(list(range(start, start + batch)))
-        after = os.times()
-        times.append(after.user + after.system - before.user - before.system)
+        times.append(time.process_time() - before)
     return 1e3 * min(times) / batch
 
 
@@ -151,8 +150,7 @@ def main() -> None:
             report["methods"][method] = row
             print(method, ", ".join(f"{key} {value:,.4g}" for key, value in row.items()), flush=True)
             file.unlink()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(report, indent=1) + "\n")
+    write_bytes(options.out, (json.dumps(report, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

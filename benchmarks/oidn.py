@@ -18,7 +18,9 @@ import torch
 from nlt.baselines.path_tracing import OpenImageDenoise, Quality
 from nlt.data.files import write_bytes
 from nlt.evaluation.provenance import origin, surroundings
+from nlt.models.policy import default_device
 from nlt.paths import PROJECT
+from nlt.report.table_writer import grid
 
 SIZES = (16, 64, 128, 256)  # 16 shows the cost that does not grow with the pixels
 WARM_UP, TIMED, ROUNDS = 3, 10, 4
@@ -29,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=PROJECT / "results/bench")
     options = parser.parse_args()
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = default_device()
     record = {**origin(), **surroundings(device), "load_average": {"before": os.getloadavg()}}
     times: dict[tuple[str, int], list[float]] = {}
     for _ in range(ROUNDS):  # interleaved, so that other work on the machine slows all modes alike
@@ -39,13 +41,18 @@ def main() -> None:
     rows = [
         {"quality": q, "size": n, "ms": statistics.median(ms), "fastest_ms": min(ms)} for (q, n), ms in times.items()
     ]
+    table = []  # a row per mode
+    for quality in get_args(Quality):
+        by_size = [times[quality, size] for size in SIZES]
+        table.append([quality, *(f"{statistics.median(ms):.1f} ({min(ms):.1f})" for ms in by_size)])
     record["load_average"]["after"] = os.getloadavg()
     before, after = (load[0] for load in record["load_average"].values())
     note = (
         "Milliseconds of `denoise` alone: the median and, in brackets, the fastest. "
         f"{record['device']}; load average {before:.1f} before, {after:.1f} after. `python benchmarks/oidn.py`"
     )
-    text = f"# Open Image Denoise\n\n{table(times)}\n\n{note}\n"
+    lines = ["# Open Image Denoise", "", *grid(["mode", *(f"{n}x{n}" for n in SIZES)], table), note, ""]
+    text = "\n".join(lines)
     write_bytes(options.out / "oidn.json", (json.dumps({**record, "rows": rows}, indent=1) + "\n").encode())
     write_bytes(options.out / "oidn.md", text.encode())
     print(text)
@@ -61,15 +68,6 @@ def measure(quality: Quality, size: int, device: torch.device) -> list[float]:
         method(batch).cpu()  # waits for the device
         times.append(1e3 * (time.perf_counter() - start))
     return times[WARM_UP:]
-
-
-def table(times: dict[tuple[str, int], list[float]]) -> str:
-    """Return a row per mode: its median and, in brackets, its fastest time at each size."""
-    lines = [f"| mode | {' | '.join(f'{n}x{n}' for n in SIZES)} |", f"|---|{'---:|' * len(SIZES)}"]
-    for quality in get_args(Quality):
-        by_size = [times[quality, size] for size in SIZES]
-        lines.append(f"| {quality} | {' | '.join(f'{statistics.median(ms):.1f} ({min(ms):.1f})' for ms in by_size)} |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

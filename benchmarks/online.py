@@ -14,7 +14,6 @@ import argparse
 import copy
 import hashlib
 import json
-import logging
 import shutil
 import sys
 import time
@@ -23,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from nlt.cli import exit_code
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset, identity_collate
@@ -35,17 +35,18 @@ from nlt.data.files import write_bytes
 from nlt.data.generate import generate
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.data.store import dataset_files
-from nlt.errors import UserError
+from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models import factory
 from nlt.models.module import Batch, RenderingModule
+from nlt.models.policy import default_device
 from nlt.paths import find_config
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from nlt.report import plots
+from nlt.report.table_writer import grid
+from nlt.training import quiet
 
 Row = dict[str, Any]  # a snapshot
 SNAPSHOTS, SHOWN, ONLINE = 20, ("mse", "mssim"), "online"
@@ -93,7 +94,7 @@ def train(config: Row, spec: DatasetSpec, root: Path, size: int | None, seed: in
 
 def build(config: Row, spec: DatasetSpec, seed: int) -> RenderingModule:
     sizes = {"num_scenes": len(spec.scenes), "num_points": spec.num_points}
-    module = factory.build(config, "the config", lr_decay=1.0, seed=seed, **sizes)
+    module = factory.build(config, "the config", lr_schedule="paper", lr_decay=1.0, seed=seed, **sizes)
     assert isinstance(module, RenderingModule)
     return module
 
@@ -104,9 +105,8 @@ def judge(module: RenderingModule, batches: list[Batch], snapshots: list[Row]) -
     for snapshot in snapshots:
         module.load_state_dict(snapshot["weights"])
         metrics = ImageMetrics(perceptual=False).to(module.device)
-        with torch.inference_mode():
-            for batch in batches:
-                metrics.update(module(batch), batch["reference_a"], batch["reference_b"], batch["exposure"])
+        for _ in evaluate(module, batches, metrics):
+            pass  # `metrics` accumulates the batches
         values = {name: float(value) for name, value in metrics.compute().items()}
         rows.append({key: value for key, value in snapshot.items() if key != "weights"} | values)
     return rows
@@ -117,8 +117,8 @@ def generate_timed(spec: DatasetSpec, root: Path, base: Path) -> float:
 
     The evaluated samples are copied from `base`.
     """
-    directory = spec.directory(root)
-    record = Path(root) / f"{directory.name}.json"
+    directory = Path(str(spec.directory(root)))
+    record = root / f"{directory.name}.json"
     if not record.exists():
         shutil.rmtree(directory, ignore_errors=True)  # begun but not timed; only this benchmark writes here
         for name in dataset_files(spec.without_train()):
@@ -151,15 +151,16 @@ def write_table(path: Path, rows: list[Row], budgets: list[float]) -> None:
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     last = {arm: [r for r in rows if r["arm"] == arm][-1] for arm in arms}
     lines = ["# Stored sets against online rendering at equal wall time", ""]
-    lines += ["| | " + " | ".join(arms) + " |", "|---|" + "---:|" * len(arms)]
-    lines += ["| generating the set (s) | " + " | ".join(f"{last[a]['generation_s']:.0f}" for a in arms) + " |"]
-    lines += ["| images trained on per second | "
-              + " | ".join(f"{last[a]['images_seen'] / last[a]['train_s']:.1f}" for a in arms) + " |"]  # fmt: skip
+    table = [
+        ["generating the set (s)", *(f"{last[a]['generation_s']:.0f}" for a in arms)],
+        ["images trained on per second", *(f"{last[a]['images_seen'] / last[a]['train_s']:.1f}" for a in arms)],
+    ]
+    lines += grid(["", *arms], table)
     for key in SHOWN:
         metric = METRICS[key]
         for account, title in ACCOUNTS.items():
-            lines += ["", f"{metric.label}, {metric.direction} is better. {title}:", ""]
-            lines += ["| minutes | " + " | ".join(arms) + " | best |", "|---:|" + "---:|" * len(arms) + "---|"]
+            lines += [f"{metric.label}, {metric.direction} is better. {title}:", ""]
+            table = []
             for budget in budgets:
                 values = {arm: at(rows, arm, key, budget, account) for arm in arms}
                 reached = {arm: value for arm, value in values.items() if value is not None}
@@ -167,12 +168,13 @@ def write_table(path: Path, rows: list[Row], budgets: list[float]) -> None:
                 best = pick(reached, key=lambda arm: reached[arm]) if reached else ""
                 cells = ["" if v is None else f"{v:{metric.format}}" for v in values.values()]
                 cells = [f"**{c}**" if arm == best else c for arm, c in zip(arms, cells, strict=True)]
-                lines.append(f"| {budget / 60:g} | " + " | ".join(cells) + f" | {best} |")
-    lines += ["", "An empty cell: the set was still being generated, or no snapshot was made yet. Means over seeds."]
+                table.append([f"{budget / 60:g}", *cells, best])
+            lines += grid(["minutes", *arms, "best"], table)
+    lines += ["An empty cell: the set was still being generated, or no snapshot was made yet. Means over seeds."]
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def draw(path: Path, rows: list[Row]) -> None:
+def draw(directory: Path, rows: list[Row]) -> None:
     """Plot MSE over wall time: on the left training alone, on the right with generation; a thin line per seed."""
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
@@ -185,12 +187,10 @@ def draw(path: Path, rows: list[Row]) -> None:
                 style = {"color": "black", "lw": 2} if arm == ONLINE else {"color": f"C{k}", "lw": 1.2}
                 axis.plot(minutes, [row["mse"] for row in mine], label=None if seed else arm, **style)
         axis.set(xlabel="wall time (min)", title=title, yscale="log")
-        axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel(f"{METRICS['mse'].label} on the test split")
-    axes[0].legend(fontsize=8)
+    axes[0].legend()
     figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    plots.save(figure, directory, "curve", ("png",))
 
 
 def main() -> None:
@@ -203,7 +203,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each arm")
     parser.add_argument("--out", default="results/online")
     options = parser.parse_args()
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    quiet()
     begun = origin()
     files = [str(find_config(kind, getattr(options, name))) for kind, name in
              (("data", "data"), ("model", "method"), ("scale", "scale"))]  # fmt: skip
@@ -212,12 +212,12 @@ def main() -> None:
     decides = {key: config.get(key) for key in ("data", "model")} | {"minutes": options.minutes, **spec.manifest}
     work = Path("runs/online") / hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
     root, out = work / "datasets", Path(options.out)
-    base = generate(spec.without_train(), root)
+    base = Path(str(generate(spec.without_train(), root)))
     generation = {size: generate_timed(replace(spec, train=size), root, base) for size in options.sizes}
     arms: list[int | None] = [*options.sizes, None]
     times = [options.minutes * 60 * (k + 1) / SNAPSHOTS for k in range(SNAPSHOTS)]
     print(f"{len(arms)} arms x {options.seeds} seeds x {options.minutes:g} min", flush=True)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = default_device()
     module = build(config, spec, 0).to(device).eval()
     test = LightTransportDataset(base, spec.without_train(), "test", module.fields)
     batches = [
@@ -235,7 +235,7 @@ def main() -> None:
             rows += [about | row for row in json.loads(record.read_text())]
             write_rows(out / "table.csv", rows)
             write_table(out / "table.md", rows, [options.minutes * 60 * share for share in (0.25, 0.5, 0.75, 1)])
-            draw(out / "curve.png", rows)
+            draw(out, rows)
             details = {"configs": config, "lr_decay": 1.0, "n_test": len(test), "generation_s": generation}
             details |= {"minutes": options.minutes, "seeds": options.seeds}
             write_manifest(out, begun | surroundings(device) | details)
@@ -243,7 +243,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(exit_code(main))

@@ -18,6 +18,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from nlt.data.dataset import LightTransportDataset, identity_collate
+from nlt.data.files import write_bytes
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.provenance import origin, surroundings
@@ -71,8 +72,7 @@ def main() -> None:
         rows = report["methods"].values()
         report[f"{policy}_worst"] = {key: max((abs(row[policy][key]) for row in rows), default=None) for key in KEYS}
         print(f"{policy}: at most {report[f'{policy}_worst']} from float32")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(report, indent=1) + "\n")
+    write_bytes(options.out, (json.dumps(report, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,9 +19,6 @@ _LIGHTNING = {
     "predict": "write the images that a checkpoint predicts for the test split",
 }
 
-# Commands in which Mitsuba and PyTorch alternate within a frame.
-_FRAMES = ("bench", "compare", "render")
-
 # Help texts of several commands.
 _IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
@@ -29,10 +26,14 @@ _SCENE = "description in configs/scenes or in your ./scenes, by name or path"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit code: 0, 2 after a user error (printed in one line), 130 if interrupted."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    """Run a command and return its exit code."""
+    return exit_code(lambda: _run(list(sys.argv[1:] if argv is None else argv)))
+
+
+def exit_code(work: Callable[[], None]) -> int:
+    """Do some work and return the exit code: 0, 2 after a user error (printed in one line), 130 if interrupted."""
     try:
-        return _run(arguments)
+        work()
     except UserError as error:
         print(f"nlt: error: {error}", file=sys.stderr)
         return 2
@@ -42,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("nlt: interrupted; run the same command again to continue", file=sys.stderr)
         return 130
+    return 0
 
 
 class _Commands(argparse._SubParsersAction):
@@ -60,16 +62,16 @@ class _Parser(argparse.ArgumentParser):
         raise UserError(f"{message}; see {self.prog} --help")
 
 
-def _run(arguments: list[str]) -> int:
+def _run(arguments: list[str]) -> None:
     if arguments and arguments[0] in _LIGHTNING:
         from nlt.training import run_lightning
 
         trainer = run_lightning(arguments).trainer
         if arguments[0] == "fit":
             print(f"written to {trainer.log_dir}")
-        return 0
+        return
     options = _parser().parse_args(arguments)
-    if options.command in _FRAMES:
+    if options.command in ("compare", "render"):  # Mitsuba and PyTorch alternate within a frame
         wait_passively()
     if options.command == "generate":
         from nlt.data.generate import generate
@@ -86,10 +88,6 @@ def _run(arguments: list[str]) -> int:
         export(options.checkpoint, options.output, options.resolution, options.photons)
     elif options.command == "render":
         _render(options)
-    elif options.command == "bench":
-        from nlt.bench.run import Benchmark
-
-        Benchmark(**{name: value for name, value in vars(options).items() if name != "command"}).run()
     elif options.command == "select":
         from nlt.select.run import select
 
@@ -103,7 +101,6 @@ def _run(arguments: list[str]) -> int:
         _report(options)
     elif options.command == "scenes":
         _scenes(options)
-    return 0
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -226,7 +223,6 @@ def _parser() -> argparse.ArgumentParser:
         "--precision", choices=("auto", "32", "bf16"), default="auto",
         help="precision of training, evaluation and timing (default: auto, bf16 if the device supports it natively)",
     )  # fmt: skip
-    _add_bench(commands.add_parser("bench", help="measure the cost of a frame, a training step and a sample"))
     export = commands.add_parser("export", help="export a trained network as one file that only needs PyTorch")
     export.add_argument("checkpoint", metavar="CKPT", help="checkpoint from nlt fit")
     export.add_argument(
@@ -266,26 +262,6 @@ def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
         "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE",
         help="option of sbatch, for example time=60",
     )  # fmt: skip
-
-
-def _add_bench(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", default="demo", help="config in configs/data, by name or path (default: demo)")
-    parser.add_argument("--scale", default="demo", help="config in configs/scale, by name or path (default: demo)")
-    parser.add_argument("--methods", nargs="+", help="configs in configs/model (default: all)")
-    parser.add_argument(
-        "--set", dest="changed", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
-        help="override resolution, num_points, num_photons, width, depth, batch_size, workers or batch (frames)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--ckpt", dest="checkpoint", metavar="CKPT", help="checkpoint of the only method (default: random weights)"
-    )
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="cpu or cuda (default: cuda if available)")
-    parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
-    parser.add_argument(
-        "--growth", nargs="*", metavar="METHOD",
-        help="also vary resolution, num_points, num_photons, width and batch (without METHOD: of nlt_photons)",
-    )  # fmt: skip
-    parser.add_argument("--out", default="results/bench", help="directory for the results (default: results/bench)")
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:

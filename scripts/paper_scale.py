@@ -1,7 +1,7 @@
 """Estimates the cost of the paper's scale from measured rates: `python scripts/paper_scale.py [results/bench/NAME]`.
 
-Everything is read from `nlt bench`'s results and the configs, except the prices and a GPU's rate, which are assumed and
-marked as such. Prints the tables of docs/cluster.md.
+Everything is read from results of benchmarks/bench.py and the configs, except the prices and a GPU's rate, which are
+assumed and marked as such. Prints the tables of docs/cluster.md.
 """
 
 import json
@@ -66,7 +66,8 @@ def tables(bench: Path) -> str:
             lines.append(f"| {what} | {count * hours:,.0f} GPU-hours | {follows} | ${count * hours * GPU_HOUR:,.0f} |")
     note = (
         f"At {spec.resolution}x{spec.resolution}, in {', '.join(manifest['scenes'])}, on {manifest['device']}: "
-        f"`{manifest['command']}`. Prices are assumed: ${CORE_HOUR} a core-hour, ${GPU_HOUR:.0f} a GPU-hour."
+        f"`{manifest['command']}` at commit {manifest['commit'][:8]}. "
+        f"Prices are assumed: ${CORE_HOUR} a core-hour, ${GPU_HOUR:.0f} a GPU-hour."
     )
     return "\n".join([*lines, "", note])
 

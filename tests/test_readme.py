@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from bench import parser as benchmark_parser
 from conftest import write_room
 from tiny import TRAINER, write
 
@@ -133,8 +134,6 @@ def parse(command):
         assert name == "compare" or load_suites(options.manifest)
     elif name == "select":
         assert SearchSpace.load(options.config, options.minutes).methods
-    elif name == "bench":
-        assert load_spec([str(find_config("data", options.data)), str(find_config("scale", options.scale))])
     elif name == "report":
         assert (PROJECT / options.directory / "manifest.json").exists()
     for scene in set(scenes) - {"room"}:
@@ -151,6 +150,9 @@ def test_commands_parse(page, sandbox):
             parse(command)
         elif program == "python":
             assert (PROJECT / rest[0]).is_file(), command
+            if rest[0] == "benchmarks/bench.py":
+                options = benchmark_parser().parse_args(rest[1:])
+                assert load_spec([str(find_config("data", options.data)), str(find_config("scale", options.scale))])
         elif program == "pip":
             assert rest[0] == "install" and re.fullmatch(r"nlt\[(\w+)\]", rest[1])[1] in extras, command
         else:

@@ -62,14 +62,14 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return dict(torch.load(path, map_location="cpu", weights_only=True))
 
 
-def load_method(path: str, place: str, device: torch.device | str = "cpu") -> RenderingModule:
+def load_method(path: str, place: str) -> RenderingModule:
     """Load the method of a checkpoint; `place`, for example an option, begins the error messages.
 
     Raises:
         UserError: the file cannot be read or is not a checkpoint.
     """
     try:
-        return RenderingModule.load_from_checkpoint(path, map_location=device)
+        return RenderingModule.load_from_checkpoint(path, map_location="cpu")
     except OSError as error:
         raise UserError(f"{place}: {path}: cannot be read: {error.strerror}") from None
     except UserError:

@@ -22,8 +22,7 @@ from nlt.scenes import mitsuba_xml
 
 Experiment = Literal["static", "fixed_lights", "moving_lights"]
 EXPERIMENTS: tuple[str, ...] = get_args(Experiment)
-Integrator = Literal["path", "bdpt"]
-INTEGRATORS: tuple[str, ...] = get_args(Integrator)  # integrators that render the images to learn from
+Integrator = Literal["path", "bdpt"]  # integrators that render the images to learn from
 # Material types of surfaces, by the lobes of their BSDFs. Datasets store the index into this tuple.
 MATERIALS = ("diffuse", "coated", "glossy", "mirror", "glass", "other")
 MOVING_LIGHT = "moving_light"  # the light's name as a movable object, and its shape id

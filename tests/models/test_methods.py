@@ -11,6 +11,7 @@ from pathlib import Path
 import lightning as L
 import pytest
 import torch
+from costs.plain import plain
 from lightning.pytorch.loggers import TensorBoardLogger
 from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
 from torch.utils.data import DataLoader
@@ -20,7 +21,6 @@ from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.baselines.feature_projection import FeatureProjection
 from nlt.baselines.path_tracing import OpenImageDenoise
-from nlt.bench.plain import plain
 from nlt.cli import main
 from nlt.config import read_configs
 from nlt.errors import UserError

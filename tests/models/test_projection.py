@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from costs import plain
 
-from nlt.bench import plain
 from nlt.models.projection import average_sparsely, project, visible_pixels
 
 H, W = 12, 16

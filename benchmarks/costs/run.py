@@ -1,7 +1,8 @@
-"""`nlt bench`: the cost of a frame, a step and a sample, compared with the plain path and the machine's ceilings."""
+"""The measurements of benchmarks/bench.py."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
@@ -9,7 +10,7 @@ import shutil
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -18,13 +19,13 @@ from typing import Any, NamedTuple
 import lightning as L
 import numpy as np
 import torch
+from costs import ceilings
+from costs.bare import Bare
+from costs.output import BENCH, write_report
+from costs.plain import plain
 from pydantic import Field, NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
-from nlt.bench import ceilings
-from nlt.bench.bare import Bare
-from nlt.bench.output import BENCH, write_report
-from nlt.bench.plain import plain
 from nlt.config import Settings, parse, read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
@@ -60,7 +61,7 @@ GRID: dict[str, Sequence[int]] = {
 }
 _POWER = {"resolution": 2, "width": 2}  # power of a factor by which costs grow at most; 1 for other factors
 _SAMPLES = 8  # least number rendered for the frames
-_TRAINING_STEPS = 40
+_TRAINING_STEPS = _TURNS = 40
 _RECORDED = 2  # first calls, in which dr.freeze records; the second, because the first assumes constants
 JOURNAL, _SAMPLES_FOLDER = "done.json", "samples"  # in the directory for work in progress
 _SAFE = 0.8  # share of the free memory that a measurement may need
@@ -92,77 +93,58 @@ class Part(NamedTuple):
 
 
 class Benchmark:
-    """Measures costs and writes bench.json, bench.md and the figures to the directory `out`."""
+    """Measures costs and writes bench.json, bench.md and the figures; `options` are those of benchmarks/bench.py.
 
-    def __init__(
-        self,
-        out: str | Path,
-        data: str,
-        scale: str,
-        methods: list[str] | None,
-        changed: Iterable[tuple[str, str]],
-        checkpoint: str | None,
-        device: str | None,
-        seconds: float,
-        growth: list[str] | None,
-    ) -> None:
-        """Check the arguments, which are the options of `nlt bench`.
+    Raises:
+        UserError: a config, method or setting is unknown, there is no such device, or the checkpoint is another
+            method's.
+    """
 
-        Args:
-            out: the directory of the results.
-            data: a config in configs/data, by name or path.
-            scale: a config in configs/scale.
-            methods: configs in configs/model; None for all except the ablation's.
-            changed: names and values of settings, out of `Sizes`, that override the configs'.
-            checkpoint: weights of the only method; None for random weights.
-            device: cpu or cuda; None for cuda where there is one.
-            seconds: time limit of a measurement.
-            growth: methods whose cost is measured over every factor of `GRID` that affects them; [] for nlt_photons.
-
-        Raises:
-            UserError: a config, method or setting is unknown, there is no such device, or the checkpoint is another
-                method's.
-        """
-        if device == "cuda" and not torch.cuda.is_available():
+    def __init__(self, options: argparse.Namespace) -> None:
+        if options.device == "cuda" and not torch.cuda.is_available():
             raise UserError("--device: cuda: this machine has none; use --device cpu")
-        self.out, self.seconds, self.checkpoint = Path(out), seconds, checkpoint
-        self.growth = ["nlt_photons"] if growth == [] else growth or []
-        self.device = torch.device(device) if device else default_device()
+        self.device = torch.device(options.device) if options.device else default_device()
+        self.out, self.seconds, self.checkpoint = Path(options.out), options.seconds, options.checkpoint
         self.work = self.out / ".bench"
         self.done: dict[Part, dict[str, Any]] = {}
-        self.files = [str(find_config("data", data)), str(find_config("scale", scale))]
+        self.files = [str(find_config("data", options.data)), str(find_config("scale", options.scale))]
         self.config = read_configs(self.files)
         self.spec, _ = load_spec(self.files)
+        self.methods = sorted(options.methods or all_methods(), key=order)
+        self.growth = ["nlt_photons"] if options.growth == [] else options.growth or []
         known = config_names("model")
-        self.methods = sorted(methods or all_methods(), key=order)
         for option, names in (("--methods", self.methods), ("--growth", self.growth)):
             for name in names:
                 if name not in known:
                     raise UserError(f"{option}: no method {name!r} in configs/model; known are {', '.join(known)}")
-        if checkpoint and (len(self.methods) != 1 or self.growth):
+        if self.checkpoint and (len(self.methods) != 1 or self.growth):
             raise UserError("--ckpt: holds one method; name only that one with --methods, without --growth")
         given = {**vars(self.spec), **self.config.get("model", {}).get("init_args", {}), **self.config["data"]}
         given = {name: value for name, value in given.items() if name in Sizes.model_fields}
-        given |= {name: int(text) if text.isdecimal() else text for name, text in changed}
+        given |= {name: int(text) if text.isdecimal() else text for name, text in options.changed}
         self.settings: dict[str, int] = parse(Sizes, given, "--set").model_dump()
         self.spec = self._sized(self.settings, 1)
         self._renderer = cache(lambda scene: SampleRenderer(self.spec, scene))
-        if checkpoint:
+        if self.checkpoint:
             self.settings |= {name: self._loaded(self.methods[0]).hparams[name] for name in _MODEL}
 
     def run(self) -> None:
         """Measure, write and print. After a kill, the same command at the same commit goes on where it was."""
         begun, start, load = origin(), time.time(), os.getloadavg()
         code = {name: begun[name] for name in ("command", "commit", "uncommitted_changes")}
-        self._resume(code)
+        journal = self.work / JOURNAL
+        stored = json.loads(journal.read_text()) if journal.exists() else {}
+        if stored.get("code") == code:
+            self.done = {Part(*part): result for part, result in stored["done"]}
+        else:  # of another command or other code
+            shutil.rmtree(self.work, ignore_errors=True)
         parts = self.parts()
         with tqdm(parts, desc="measuring", unit="part", file=sys.stderr) as bar:
             for part in bar:
                 bar.set_postfix_str(str(part))
                 if part not in self.done:
                     self.done[part] = self.measure(part)
-                    journal = json.dumps({"code": code, "done": list(self.done.items())})
-                    write_bytes(self.work / JOURNAL, journal.encode())
+                    write_bytes(journal, json.dumps({"code": code, "done": list(self.done.items())}).encode())
         manifest = {
             **begun,
             **surroundings(self.device),
@@ -180,15 +162,6 @@ class Benchmark:
         write_report(self.out)
         shutil.rmtree(self.work)
         print((self.out / "bench.md").read_text())
-
-    def _resume(self, code: Mapping[str, Any]) -> None:
-        """Read the finished measurements of the same command and code; delete those of any other."""
-        journal = self.work / JOURNAL
-        stored = json.loads(journal.read_text()) if journal.exists() else {}
-        if stored.get("code") == code:
-            self.done = {Part(*part): result for part, result in stored["done"]}
-        else:
-            shutil.rmtree(self.work, ignore_errors=True)
 
     def parts(self) -> list[Part]:
         """Return all measurements in order, those of growth from small to large."""
@@ -246,7 +219,7 @@ class Benchmark:
         return build(config, file, **arguments, num_points=settings["num_points"])
 
     def _loaded(self, name: str) -> RenderingModule:
-        method = load_method(str(self.checkpoint), "--ckpt", self.device)
+        method = load_method(str(self.checkpoint), "--ckpt")
         file = find_config("model", name)
         wanted = method_class(read_configs([file]), file)
         if type(method) is not wanted:
@@ -257,7 +230,7 @@ class Benchmark:
             if key in method.architecture and method.hparams[key] != here:
                 raise UserError(
                     f"--ckpt: {self.checkpoint}: has {key}={method.hparams[key]}, these settings have {here}: "
-                    "use the --data, --scale and --set points it was trained with"
+                    "use the --data, --scale and --set num_points it was trained with"
                 )
         return method
 
@@ -350,9 +323,9 @@ class Benchmark:
         precision = {**trainer_defaults(), **self.config.get("trainer", {})}.get("precision")
         quiet()
         trainer = L.Trainer(
-            max_epochs=-1, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1, callbacks=[steps],
-            logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
-            use_distributed_sampler=False, limit_val_batches=0, precision=precision,
+            max_steps=1 + _TRAINING_STEPS, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1,
+            callbacks=[steps], logger=False, enable_checkpointing=False, enable_progress_bar=False,
+            enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, precision=precision,
         )  # fmt: skip
         trainer.fit(method.train(), datamodule=data)
         whole = [a + b for a, b in zip(steps.waited, steps.computed, strict=True)]
@@ -369,11 +342,8 @@ class Benchmark:
         data = self.data()
         data.setup("fit")
         loader = data.train_dataloader()
-        rates = []
-        for _ in ceilings.repeat(self.seconds / 2, least=2):
-            samples, seconds = _timed(lambda: sum(len(batch["scene"]) for batch in loader))
-            rates.append(samples / seconds)
-        rate = statistics.median(rates[1:])
+        count = lambda: sum(len(batch["scene"]) for batch in loader)
+        rate = count() / ceilings.timer(count).blocked_autorange(min_run_time=self.seconds / 2).median
         return {"samples_per_second": rate, "bytes_per_second": rate * data.spec.nbytes("train")}
 
     def _generation(self) -> dict[str, Any]:
@@ -383,13 +353,18 @@ class Benchmark:
         bare = Bare(render, frozen=True)
         views = [(render.place("train", k), render.scene.state) for k in range(_SAMPLES)]
         stages: list[dict[str, float]] = []
-        pairs: list[tuple[float, float]] = []
-        for turn in ceilings.repeat(self.seconds, least=_RECORDED + LEAST_FRAMES, most=_TRAINING_STEPS):
+        ratios: list[float] = []
+        begin = time.perf_counter()
+        for turn in range(_TURNS):
+            if turn >= _RECORDED + LEAST_FRAMES and time.perf_counter() - begin > self.seconds:
+                break
             k = turn % _SAMPLES
-            sample, ours = _timed(partial(render.sample, "train", k))
+            start = time.perf_counter()
+            sample = render.sample("train", k)
+            middle = time.perf_counter()
             camera, state = views[k - 1]  # another view, so that the bare loop moves the objects too
-            _, theirs = _timed(partial(bare.sample, state, camera, "train", k))
-            pairs.append((ours, theirs))
+            bare.sample(state, camera, "train", k)
+            ratios.append((time.perf_counter() - middle) / (middle - start))
             stages.append(laps(render, k, partial(write_shard, self.work / "shard", [sample])))
         medians = {name: statistics.median(s[name] for s in stages[_RECORDED:]) for name in stages[0]}
         medians["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
@@ -398,7 +373,7 @@ class Benchmark:
             "stages_s": medians,
             "train_per_second": 1 / (whole - medians["reference"]),
             "evaluated_per_second": 1 / whole,
-            "of_bare_loop": statistics.median(b / a for a, b in pairs[_RECORDED:]),
+            "of_bare_loop": statistics.median(ratios[_RECORDED:]),
         }
 
 
@@ -421,14 +396,7 @@ class _Steps(L.Callback):
             self.waited.append(self.start - self.end)
             self.computed.append(now - self.start)
         self.end = now
-        steps = len(self.waited)
-        trainer.should_stop = steps >= _TRAINING_STEPS or (steps > 0 and now - self.begin > self.seconds)
-
-
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    start = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - start
+        trainer.should_stop = bool(self.waited) and now - self.begin > self.seconds
 
 
 def _network(seconds: Mapping[str, Any], suffix: str = "") -> float:

@@ -1,4 +1,4 @@
-"""`nlt bench` is complete, consistent and resumable, and the plain path is plain."""
+"""benchmarks/bench.py is complete, consistent and resumable, and the plain path is plain."""
 
 import json
 import re
@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from bench import main, parser
+from costs import ceilings
+from costs import run as bench
+from costs.plain import plain
 from synthetic import POINTS, SCENES, synthetic_batch
 from tiny import DATASET, SCALE, write
 
-from nlt.bench import ceilings
-from nlt.bench import run as bench
-from nlt.bench.plain import plain
-from nlt.cli import main
+from nlt.config import merge
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.evaluation import clock
@@ -104,15 +105,16 @@ def arguments(tmp_path_factory):
     """Yield the arguments of a benchmark that takes seconds."""
     folder = tmp_path_factory.mktemp("bench")
     data = write(folder / "data.yaml", {"data": {"dataset": DATASET, "batch_size": 2, "workers": 0}})
-    scale = write(folder / "scale.yaml", SCALE)
+    scale = write(folder / "scale.yaml", merge(SCALE, {"model": {"init_args": {"lr_schedule": "cosine"}}}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench, "GRID", GRID)
         patch.setattr(bench, "_TRAINING_STEPS", 3)
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
-        patch.setattr(ceilings, "_LARGEST", {"matmul": 512, "convolution": 1})
+        patch.setattr(ceilings, "MATRICES", (512,))
+        patch.setattr(ceilings, "BATCHES", (1,))
         patch.setattr(ceilings, "_COPIED", 1 << 20)
-        yield ["bench", "--data", str(data), "--scale", str(scale), "--methods", *METHODS, "--seconds", "1"]
+        yield ["--data", str(data), "--scale", str(scale), "--methods", *METHODS, "--seconds", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +148,7 @@ def test_everything_is_there_and_adds_up(made):
     content = json.loads((made[0] / "bench.json").read_text())
     rows = {tuple(row[k] for k in ("kind", "method", "factor", "value")): row for row in content["parts"]}
     settings = content["manifest"]["settings"]
-    assert (settings["points"], settings["resolution"], settings["width"]) == (48, 16, 2)
+    assert (settings["num_points"], settings["resolution"], settings["width"]) == (48, 16, 2)
     for method in METHODS:
         row = rows["frame", method, "", 0]
         assert row["timed_frames"] == 3
@@ -194,7 +196,8 @@ def test_the_table_says_what_the_json_says(made):
 
 def test_what_would_take_too_long_is_skipped_and_said(arguments, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "GRID", {"width": (2, 4, 8)})
-    run = bench.Benchmark(tmp_path, arguments[2], arguments[4], ["cnn"], [], None, "cpu", 1.0, ["cnn"])
+    more = ["--methods", "cnn", "--growth", "cnn", "--device", "cpu", "--out", str(tmp_path)]
+    run = bench.Benchmark(parser().parse_args([*arguments, *more]))
     part = bench.Part("growth", "cnn", "width", 4)
     run.done = {bench.Part("growth", "cnn", "width", 2): {"time_per_frame_s": 0.3, "peak_memory_bytes": 8}}
     skipped = run.measure(part)["skipped"]
@@ -232,14 +235,13 @@ def test_mistakes(arguments, more, words, tmp_path, capfd):
 
 
 def test_another_methods_checkpoint(arguments, checkpoint, tmp_path, capfd):
-    assert main([*arguments[:5], "--methods", "nlt", "--ckpt", str(checkpoint), "--out", str(tmp_path)]) == 2
+    assert main([*arguments, "--methods", "nlt", "--ckpt", str(checkpoint), "--out", str(tmp_path)]) == 2
     assert "CNN" in capfd.readouterr().err
 
 
 def test_a_checkpoint_gives_weights_and_size(arguments, checkpoint, tmp_path):
-    run = bench.Benchmark(
-        tmp_path, arguments[2], arguments[4], ["cnn"], [("width", "7")], str(checkpoint), "cpu", 1.0, None
-    )
+    more = ["--methods", "cnn", "--set", "width=7", "--ckpt", str(checkpoint), "--device", "cpu"]
+    run = bench.Benchmark(parser().parse_args([*arguments, *more, "--out", str(tmp_path)]))
     saved = torch.load(checkpoint, weights_only=True)
     assert run.settings["width"] == saved["architecture"]["width"] == 2
     weights = run.method("cnn", run.settings).state_dict()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label
 from nlt.metrics.quantities import STAGES
 from nlt.report import plots
-from nlt.report.table_writer import grid
+from nlt.report.table_writer import Table, grid, section
 
 BENCH = "bench.json"
 _COLOUR = dict(zip(STAGES, (*plots.COLOURS[:6], "#999999"), strict=True))
@@ -27,9 +28,9 @@ Row = dict[str, Any]
 def write_report(directory: Path) -> None:
     """Write bench.md, bench.png and .svg, and growth.png and .svg if growth was measured."""
     content = json.loads((directory / BENCH).read_text())
-    parts: dict[str, list[Row]] = {"training": [], "growth": []}
+    parts = defaultdict(list)
     for part in content["parts"]:
-        parts.setdefault(part["kind"], []).append(part)
+        parts[part["kind"]].append(part)
     write_bytes(directory / "bench.md", _markdown(content["manifest"], parts).encode())
     _draw_frames(directory, parts["frame"])
     if parts["growth"]:
@@ -59,7 +60,7 @@ def _mib(row: Row) -> str:
     return f"{row['peak_memory_bytes'] / 2**20:.0f}" if "peak_memory_bytes" in row else "–"
 
 
-def _markdown(manifest: Row, parts: dict[str, list[Row]]) -> str:
+def _markdown(manifest: Row, parts: Mapping[str, list[Row]]) -> str:
     settings, size = manifest["settings"], manifest["settings"]["resolution"]
     before, after = manifest["load_average"]["before"], manifest["load_average"]["after"]
     (ceilings,), (generation,), (loading,) = (parts[kind] for kind in ("ceilings", "generation", "loading"))
@@ -132,7 +133,7 @@ def _training(rows: list[Row]) -> list[str]:
             f"{row['images_per_second']:.2f}", _ms_p95(row, "step"), f"{row['waiting_share']:.1%}",
         ]  # fmt: skip
         table.append([label(row["method"]), *cells])
-    return ["## Training", "", *grid(["method", "images per second", "step (ms)", "waiting for data"], table)]
+    return section(Table("Training", "", ["images per second", "step (ms)", "waiting for data"], table))
 
 
 def _ceilings(ceilings: Row, settings: Row) -> list[str]:
@@ -140,13 +141,14 @@ def _ceilings(ceilings: Row, settings: Row) -> list[str]:
     copy = computing.pop("copy")
     table = [[name.replace("_", ", "), f"{value / 1e9:.0f} GFLOP/s"] for name, value in computing.items()]
     table.append(["copying memory, read and written", f"{copy / 1e9:.1f} GB/s"])
-    names = {"path_tracing": "at 1 spp", "gbuffer": "of depth, normal and albedo", "photons": ""}
-    size = settings["resolution"]
-    for name, seconds in ceilings["bare_s"].items():
-        bare = f"{settings['num_photons']:,} photons, bare"
-        title = f"`mi.render` {names[name]}, {size}x{size}" if names[name] else bare
-        table.append([title, f"{1e3 * seconds:.2f} ms"])
-    return ["## This machine's ceilings, in the same run", "", *grid(["", "best"], table)]
+    size = f"{settings['resolution']}x{settings['resolution']}"
+    names = {
+        "path_tracing": f"`mi.render` at 1 spp, {size}",
+        "gbuffer": f"`mi.render` of depth, normal and albedo, {size}",
+        "photons": f"{settings['num_photons']:,} photons, bare",
+    }
+    table += [[names[name], f"{1e3 * seconds:.2f} ms"] for name, seconds in ceilings["bare_s"].items()]
+    return section(Table("This machine's ceilings, in the same run", "", ["best"], table, first=""))
 
 
 def _growth(rows: list[Row]) -> list[str]:
@@ -157,13 +159,8 @@ def _growth(rows: list[Row]) -> list[str]:
         name = f"{label(row['method'])}, {row['factor']} {row['value']:,}"
         whole = row.get("skipped") or _ms_p95(row, "time_per_frame")
         table.append([name, *(_ms(row, stage) for stage in stages), whole, _mib(row)])
-    return [
-        "## Growth",
-        "",
-        "Median milliseconds with one setting changed at a time; with a larger batch, those of all its frames.",
-        "",
-        *grid(["", *_names(stages), "frame", "peak MiB"], table),
-    ]
+    note = "Median milliseconds with one setting changed at a time; with a larger batch, those of all its frames."
+    return section(Table("Growth", note, [*_names(stages), "frame", "peak MiB"], table, first=""))
 
 
 def _draw_frames(directory: Path, rows: list[Row]) -> None:
