@@ -9,13 +9,14 @@ from textwrap import fill
 import matplotlib.pyplot as plt
 import numpy as np
 
+from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import IMAGES, MANIFEST
-from nlt.report import plots
+from nlt.evaluation.results import MANIFEST, Results, write_rows
+from nlt.report import plots, table_writer
 from nlt.report.page import Section
 from nlt.stress import tables
 from nlt.stress.suites import RENDERED
-from nlt.stress.tables import BREAKING, DOUBLED, ROWS, STRESS, TEXT, TRAININGS, Ladder, Stressed
+from nlt.stress.tables import BREAKING, DOUBLED, ROWS, STRESS, TEXT, TRAININGS, Stressed
 
 _CEILING = 1e3  # growth at which curves are clipped
 _ACROSS = 6  # panels of curves in a row
@@ -23,24 +24,25 @@ _WORST = 8  # rows of the gallery
 
 
 def stress_section(results: Path) -> Section | None:
-    """Draw the stress suites of a comparison's results and return their report section; None without results."""
-    stressed = tables.load_stress(results / STRESS)
+    """Write tables and figures of a comparison's stress results and return their report section; None without them."""
+    stressed = Stressed.load(results / STRESS)
     if stressed is None:
         return None
-    tables.write_stress(stressed)
+    directory = stressed.directory
+    paragraphs = [tables.introduction(stressed), *(tables.about(stressed, method) for method in stressed.methods)]
+    drawn = tables.tables(stressed)
+    lines = ["# Where methods fail", "", *(line for paragraph in paragraphs for line in (paragraph, ""))]
+    lines += [line for table in drawn for line in table_writer.section(table)]
+    lines += [f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}.", ""]
+    write_bytes(directory / TEXT, "\n".join(lines).encode())
+    write_rows(directory / BREAKING, tables.breaking_rows(stressed))
     if stressed.errors:
         _draw_curves(stressed)
         _draw_map(stressed)
         _draw_worst(stressed)
-    return Section(
-        STRESS,
-        "Where methods fail",
-        [tables.introduction(stressed), *(tables.about(stressed, method) for method in stressed.methods)],
-        tables.tables(stressed),
-        stressed.directory,
-        (ROWS, BREAKING, TRAININGS, TEXT, MANIFEST),
-        f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}",
-    )
+    files = (ROWS, BREAKING, TRAININGS, TEXT, MANIFEST)
+    source = f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}"
+    return Section(STRESS, "Where methods fail", paragraphs, drawn, directory, files, source)
 
 
 def _draw_curves(stressed: Stressed) -> None:
@@ -66,17 +68,15 @@ def _draw_curves(stressed: Stressed) -> None:
 
 def _draw_map(stressed: Stressed) -> None:
     """Draw stress_map: each method's breaking point on each ladder; darker is earlier, blank is not affected."""
-    ladders, methods = list(stressed.errors), stressed.methods
+    ladders, methods = list(stressed.breaks), stressed.methods
     size = (2.6 + 0.55 * len(methods), 1.4 + 0.22 * len(ladders))
     figure, axis = plt.subplots(figsize=size, layout="constrained")
     points = np.full((len(ladders), len(methods)), np.nan)
     for row, ladder in enumerate(ladders):
-        for method, errors in stressed.errors[ladder].items():
-            column, at = methods.index(method), tables.breaking_point(errors / errors[0])
+        for method, at in stressed.breaks[ladder].items():
+            column, text = methods.index(method), stressed.break_text(ladder, method)
             points[row, column] = min(at, 5.5)
-            colour = "white" if at < 3 else "black"
-            text = tables.severity(at, len(errors) - 1)
-            axis.text(column, row, text, ha="center", va="center", fontsize=6.5, color=colour)
+            axis.text(column, row, text, ha="center", va="center", fontsize=6.5, color="white" if at < 3 else "black")
     axis.imshow(points, cmap="cividis", vmin=0, vmax=5.5, aspect="auto")
     axis.set_xticks(range(len(methods)), map(label, methods), rotation=40, ha="right", fontsize=7)
     axis.set_yticks(range(len(ladders)), map(stressed.title, ladders), fontsize=7)
@@ -90,9 +90,19 @@ def _draw_worst(stressed: Stressed) -> None:
 
     The method whose error grew most is framed.
     """
-    picked = _worst_views(stressed)
+    worst_of_ladders = [
+        max(
+            (row["error"] / own[0], ladder, place, method)
+            for method, own in errors.items()
+            for place, row in enumerate(stressed.views(method, ladder, len(own) - 1))
+        )
+        for ladder, errors in stressed.errors.items()
+        if ladder[0] in RENDERED
+    ]
+    picked = sorted(worst_of_ladders, reverse=True)[:_WORST]
     suites, names = {suite for _, (suite, _), _, _ in picked}, ("reference", *stressed.methods)
-    stored = {(suite, name): _images(stressed, suite, name) for suite in suites for name in names}
+    results = Results(stressed.directory, stressed.manifest, [], [])
+    stored = {(suite, name): results.images(f"{suite}-{name}") or {} for suite in suites for name in names}
     columns = [name for name in names if all(stored[suite, name] for suite in suites)]
     if not picked or "reference" not in columns:
         return  # images exist only on the machine that made them
@@ -109,26 +119,3 @@ def _draw_worst(stressed: Stressed) -> None:
             fontsize=6, color="white", bbox={"facecolor": "black", "alpha": 0.6, "pad": 1, "lw": 0},
         )  # fmt: skip
     plots.save(figure, stressed.directory, "stress_worst", plots.PICTURE)
-
-
-def _worst_views(stressed: Stressed) -> list[tuple[float, Ladder, int, str]]:
-    """Return growth, ladder, place of the view and method where an error grew most, for the worst rendered ladders."""
-    worst = []
-    for ladder, errors in stressed.errors.items():
-        if ladder[0] in RENDERED:
-            worst.append(
-                max(
-                    (row["error"] / own[0], ladder, place, method)
-                    for method, own in errors.items()
-                    for place, row in enumerate(stressed.views(method, ladder, len(own) - 1))
-                )
-            )
-    return sorted(worst, reverse=True)[:_WORST]
-
-
-def _images(stressed: Stressed, suite: str, method: str) -> dict[str, np.ndarray]:
-    path = stressed.directory / IMAGES / f"{suite}-{method}.npz"
-    if not path.exists():
-        return {}
-    with np.load(path) as file:
-        return dict(file)

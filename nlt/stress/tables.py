@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label, order
-from nlt.evaluation.results import MANIFEST, OK, read_rows, write_rows
-from nlt.report.table_writer import Table, section
+from nlt.evaluation.results import MANIFEST, OK, read_rows
+from nlt.report.table_writer import Table
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
 
 STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
@@ -36,6 +35,14 @@ class Stressed:
     rows: list[Row]
     trainings: list[Row]
 
+    @classmethod
+    def load(cls, directory: Path) -> Stressed | None:
+        """Read the stress results in a directory; None where there are none."""
+        if not (directory / ROWS).exists() or not (directory / MANIFEST).exists():
+            return None
+        trainings = read_rows(directory / TRAININGS) if (directory / TRAININGS).exists() else []
+        return cls(directory, json.loads((directory / MANIFEST).read_text()), read_rows(directory / ROWS), trainings)
+
     @cached_property
     def methods(self) -> list[str]:
         return sorted({row["method"] for row in self.rows}, key=order)
@@ -53,19 +60,24 @@ class Stressed:
         return f"{ladder[0]}: {self.says(ladder)}"
 
     @cached_property
-    def _groups(self) -> dict[tuple[str, str, str], list[Row]]:
-        groups: dict[tuple[str, str, str], list[Row]] = {}
+    def _groups(self) -> dict[tuple[str, str, str, int], list[Row]]:
+        groups: dict[tuple[str, str, str, int], list[Row]] = {}
         for row in self.rows:
-            groups.setdefault((row["method"], row["suite"], row["ladder"]), []).append(row)
+            groups.setdefault((row["method"], row["suite"], row["ladder"], row["severity"]), []).append(row)
         return groups
 
     def views(self, method: str, ladder: Ladder, severity: int) -> list[Row]:
         """Return the rows of a method's views at a severity; none where the ladder does not affect the method."""
-        return [row for row in self._groups.get((method, *ladder), []) if row["severity"] == severity]
+        return self._groups.get((method, *ladder, severity), [])
+
+    def mean(self, method: str, ladder: Ladder, severity: int, key: str = "error") -> float:
+        """Return a column's mean over those rows; NaN if there are none."""
+        rows = self.views(method, ladder, severity)
+        return float(np.mean([row[key] for row in rows])) if rows else math.nan
 
     def clean(self, method: str) -> float:
         """Return the error on the clean views."""
-        return _mean(self.views(method, (CLEAN, "views"), 0), "error")
+        return self.mean(method, (CLEAN, "views"), 0)
 
     @cached_property
     def errors(self) -> dict[Ladder, dict[str, np.ndarray]]:
@@ -76,59 +88,44 @@ class Stressed:
         errors: dict[Ladder, dict[str, np.ndarray]] = {}
         ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.suites[suite]]
         for ladder, method in itertools.product(ladders, self.methods):
-            means = [max(_mean(rows, "error"), 0.0) for k in range(1, 6) if (rows := self.views(method, ladder, k))]
-            if means:
+            severities = [k for k in range(1, 6) if self.views(method, ladder, k)]
+            if severities:
+                means = [max(self.mean(method, ladder, k), 0.0) for k in severities]
                 errors.setdefault(ladder, {})[method] = np.array([self.clean(method), *means])
         return errors
 
-    def flicker(self, method: str, kind: str) -> float:
-        """Return the mean over scenes of a kind's value; NaN where the method is not affected."""
-        return _mean(self._groups.get((method, FLICKER, kind), []), "value")
+    @cached_property
+    def breaks(self) -> dict[Ladder, dict[str, float]]:
+        """The breaking point of each method on each ladder, for the same ones as `errors`."""
+        errors = self.errors.items()
+        return {
+            ladder: {m: breaking_point(own / own[0]) for m, own in by_method.items()} for ladder, by_method in errors
+        }
 
-
-def _mean(rows: list[Row], key: str) -> float:
-    return float(np.mean([row[key] for row in rows])) if rows else math.nan
+    def break_text(self, ladder: Ladder, method: str) -> str:
+        """Return a breaking point as text: > and the highest severity where the method never breaks."""
+        at = self.breaks[ladder][method]
+        return f"{at:.1f}" if math.isfinite(at) else f"> {len(self.errors[ladder][method]) - 1}"
 
 
 def breaking_point(growth: np.ndarray) -> float:
     """Return the severity at which the error has doubled, by linear interpolation; infinite if it never does."""
-    for severity in range(1, len(growth)):
-        if growth[severity] >= DOUBLED:
-            before, after = growth[severity - 1], growth[severity]
-            return float(severity - 1 + (DOUBLED - before) / (after - before))
+    for severity, (before, after) in enumerate(itertools.pairwise(growth)):
+        if after >= DOUBLED:
+            return float(severity + (DOUBLED - before) / (after - before))
     return math.inf
 
 
-def load_stress(directory: Path) -> Stressed | None:
-    """Read the stress results in a directory; None where there are none."""
-    if not (directory / ROWS).exists() or not (directory / MANIFEST).exists():
-        return None
-    trainings = read_rows(directory / TRAININGS) if (directory / TRAININGS).exists() else []
-    return Stressed(directory, json.loads((directory / MANIFEST).read_text()), read_rows(directory / ROWS), trainings)
-
-
-def write_stress(stressed: Stressed) -> None:
-    """Write breaking.csv and stress.md."""
-    write_rows(stressed.directory / BREAKING, _rows(stressed))
-    lines = ["# Where methods fail", ""]
-    for paragraph in (introduction(stressed), *(about(stressed, method) for method in stressed.methods)):
-        lines += [paragraph, ""]
-    for table in tables(stressed):
-        lines += section(table)
-    lines += [f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}.", ""]
-    write_bytes(stressed.directory / TEXT, "\n".join(lines).encode())
-
-
-def _rows(stressed: Stressed) -> list[Row]:
-    """Return a row per method and ladder: errors, their growth and ranks by severity, and the breaking point."""
+def breaking_rows(stressed: Stressed) -> list[Row]:
+    """Return the rows of breaking.csv, by method and ladder: errors, growth and ranks by severity, breaking point."""
     rows = []
-    for (suite, name), errors in stressed.errors.items():
+    for ladder, errors in stressed.errors.items():
         ranks = scipy.stats.rankdata(list(errors.values()), axis=0, method="min").astype(int)
         for (method, own), own_ranks in zip(errors.items(), ranks, strict=True):
-            row: Row = {"method": method, "suite": suite, "ladder": name}
+            row: Row = {"method": method, "suite": ladder[0], "ladder": ladder[1]}
             for column, values in {"error": own, "growth": own / own[0], "rank": own_ranks}.items():
                 row |= {f"{column}_{k}": value for k, value in enumerate(values)}
-            rows.append(row | {"breaks_at": breaking_point(own / own[0])})
+            rows.append(row | {"breaks_at": stressed.breaks[ladder][method]})
     return rows
 
 
@@ -147,12 +144,23 @@ def introduction(stressed: Stressed) -> str:
 
 def about(stressed: Stressed, method: str) -> str:
     """Return a Markdown paragraph: where and how much a method breaks, which is better there, what it withstands."""
-    errors = {ladder: own for ladder, errors in stressed.errors.items() if (own := errors.get(method)) is not None}
-    points = {ladder: breaking_point(own / own[0]) for ladder, own in errors.items()}
+    points = {ladder: own[method] for ladder, own in stressed.breaks.items() if method in own}
     broken = sorted((at, ladder) for ladder, at in points.items() if math.isfinite(at))
     held = [stressed.says(ladder) for ladder, at in points.items() if not math.isfinite(at)]
     parts = [f"**{label(method)}** has a clean error of {stressed.clean(method):.3g}."]
-    parts += [_break(stressed, method, ladder, at) for at, ladder in broken[:5]]
+    for at, ladder in broken[:5]:
+        errors = stressed.errors[ladder]
+        worst = int(errors[method].argmax())  # not always the highest severity: a camera close to a wall sees little
+        at_worst = {m: errors[m][worst] if m in errors else stressed.clean(m) for m in stressed.methods}
+        own = at_worst.pop(method)
+        best = min(at_worst, key=at_worst.__getitem__, default=None)
+        advice = ""
+        if best is not None and at_worst[best] < own:
+            advice = f"; there {label(best)} has {at_worst[best]:.3g} against its {own:.3g}"
+        elif best is not None:
+            advice = f"; yet no other method has less than its {own:.3g} there"
+        times = f"{own / errors[method][0]:.3g} times the clean error at severity {worst}"
+        parts.append(f"It breaks with {stressed.says(ladder)} at severity {at:.1f} ({times}{advice}).")
     if len(broken) > 5:
         rest = ", ".join(f"{stressed.says(ladder)} ({at:.1f})" for at, ladder in broken[5:])
         parts.append(f"Further, it breaks with {rest}.")
@@ -163,87 +171,58 @@ def about(stressed: Stressed, method: str) -> str:
     return " ".join(parts)
 
 
-def _break(stressed: Stressed, method: str, ladder: Ladder, at: float) -> str:
-    """Return a sentence on a ladder that breaks a method at severity `at`, and on the best other method there."""
-    errors = stressed.errors[ladder]
-    worst = int(errors[method].argmax())  # not always the highest severity: a camera very close to a wall sees little
-    at_worst = {m: errors[m][worst] if m in errors else stressed.clean(m) for m in stressed.methods}
-    own = at_worst.pop(method)
-    best = min(at_worst, key=at_worst.__getitem__, default=None)
-    advice = ""
-    if best is not None and at_worst[best] < own:
-        advice = f"; there {label(best)} has {at_worst[best]:.3g} against its {own:.3g}"
-    elif best is not None:
-        advice = f"; yet no other method has less than its {own:.3g} there"
-    times = f"{own / errors[method][0]:.3g} times the clean error at severity {worst}"
-    return f"It breaks with {stressed.says(ladder)} at severity {at:.1f} ({times}{advice})."
-
-
 def tables(stressed: Stressed) -> list[Table]:
     """Return the tables of breaking points, ranks, flicker and trainings, without empty ones."""
-    all_tables = [_breaking(stressed), _ranking(stressed), _flicker(stressed), _training(stressed)]
-    return [table for table in all_tables if table.rows]
-
-
-def _breaking(stressed: Stressed) -> Table:
-    rows = []
+    methods = stressed.methods
+    points, ranks, flicker = [], [], []
     for ladder, errors in stressed.errors.items():
-        growths = [errors[method] / errors[method][0] if method in errors else None for method in stressed.methods]
-        cells = [_NONE if g is None else f"{severity(breaking_point(g), len(g) - 1)} ({g[-1]:.2g})" for g in growths]
-        rows.append([stressed.title(ladder), *cells])
-    note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
-    return Table("Breaking points", note, [label(method) for method in stressed.methods], rows, first="ladder")
-
-
-def severity(at: float, highest: int) -> str:
-    """Return a breaking point as text."""
-    return f"{at:.1f}" if math.isfinite(at) else f"> {highest}"
-
-
-def _ranking(stressed: Stressed) -> Table:
-    """Compare the order of the methods at the highest severity with that on the clean views."""
-    rows = []
-    for ladder, errors in stressed.errors.items():
+        growth = {method: f"({own[-1] / own[0]:.2g})" for method, own in errors.items()}
+        cells = [f"{stressed.break_text(ladder, m)} {growth[m]}" if m in errors else _NONE for m in methods]
+        points.append([stressed.title(ladder), *cells])
         if len(errors) > 1:
             values = np.stack(list(errors.values()))[:, [0, -1]]
-            tau = scipy.stats.kendalltau(*values.T).statistic
             best = [label(list(errors)[k]) for k in values.argmin(0)]
-            rows.append([stressed.title(ladder), *best, _number(tau, ".2f")])
-    columns = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
-    return Table("Ranks", "", columns, rows, first="ladder")
-
-
-def _flicker(stressed: Stressed) -> Table:
-    rows = []
-    for method in stressed.methods if any(row["suite"] == FLICKER for row in stressed.rows) else ():
-        draws = [_number(100 * stressed.flicker(method, kind), ".2f") for kind in _FLICKERS]
-        rows.append([label(method), *draws, *(_number(stressed.flicker(method, kind)) for kind in PATHS)])
-    note = (
+            ranks.append([stressed.title(ladder), *best, _number(scipy.stats.kendalltau(*values.T).statistic, ".2f")])
+    for method in methods if any(row["suite"] == FLICKER for row in stressed.rows) else ():
+        value = lambda kind, method=method: stressed.mean(method, (FLICKER, kind), 0, "value")
+        draws = [_number(100 * value(kind), ".2f") for kind in _FLICKERS]
+        flicker.append([label(method), *draws, *(_number(value(kind)) for kind in PATHS)])
+    note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
+    flicker_note = (
         "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
         "square change from frame to frame on a smooth path, over the reference's."
     )
-    return Table("Flicker", note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], rows)
+    best = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
+    all_tables = [
+        Table("Breaking points", note, [label(method) for method in methods], points, first="ladder"),
+        Table("Ranks", "", best, ranks, first="ladder"),
+        Table("Flicker", flicker_note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], flicker),
+        _trainings(stressed),
+    ]
+    return [table for table in all_tables if table.rows]
 
 
-def _training(stressed: Stressed) -> Table:
-    rows, trained = [], stressed.trainings
-    kinds = list(dict.fromkeys((r["variation"], str(r["value"])) for r in trained if r["variation"] != "seed"))
+def _trainings(stressed: Stressed) -> Table:
+    by_method: dict[str, dict[tuple[str, str], Row]] = {}
+    for row in stressed.trainings:
+        by_method.setdefault(row["method"], {})[row["variation"], str(row["value"])] = row
+    kinds = list(dict.fromkeys(kind for own in by_method.values() for kind in own if kind[0] != "seed"))
+    cells = []
+    for method, own in by_method.items():
+        seeds = [row for (variation, _), row in own.items() if variation == "seed"]
+        errors = np.array([row["error"] for row in seeds if row["status"] == OK])
+        lost = f", {len(seeds) - len(errors)} lost" if len(errors) < len(seeds) else ""
+        mean = errors.mean() if len(errors) else math.nan
+        spread = f"{mean:.3g} ± {errors.std(ddof=1):.2g}" if len(errors) > 1 else _number(mean)
+        outcomes = [own.get(kind, {"status": _NONE}) for kind in kinds]
+        cells.append([label(method), spread + lost])
+        cells[-1] += [_number(row["error"]) if row["status"] == OK else row["status"] for row in outcomes]
     content = stressed.suites["training"]
-    for method in dict.fromkeys(row["method"] for row in trained):
-        own = [row for row in trained if row["method"] == method]
-        seeds = np.array([row["error"] for row in own if row["variation"] == "seed" and row["status"] == OK])
-        lost = sum(row["status"] != OK for row in own if row["variation"] == "seed")
-        spread = f"{seeds.mean():.3g} ± {seeds.std(ddof=1):.2g}" if len(seeds) > 1 else _number(seeds.sum() or math.nan)
-        cells = [spread + (f", {lost} lost" if lost else "")]
-        for kind in kinds:
-            row = next((row for row in own if (row["variation"], str(row["value"])) == kind), None)
-            cells.append(_NONE if row is None else row["status"] if row["status"] != OK else _number(row["error"]))
-        rows.append([label(method), *cells])
     note = (
         f"Trained anew for {content['share']:.0%} of the steps: the error over {content['seeds']} seeds "
         "(mean ± standard deviation), and that of one seed with a change."
     )
-    return Table("Training", note, ["seeds", *(f"{a} {b}" for a, b in kinds)], rows)
+    return Table("Training", note, ["seeds", *(f"{a} {b}" for a, b in kinds)], cells)
 
 
 def _number(value: float, form: str = ".3g") -> str:
