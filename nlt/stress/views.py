@@ -65,9 +65,8 @@ class SuiteViews:
             return self._flicker(method), {}
         rows, images = [], {}
         for ladder, severity, batches in self._changed(suite, method):
-            view_rows, radiance = self.rows(method, batches)
+            view_rows, images[ladder] = self.rows(method, batches)
             rows += [{"ladder": ladder, "severity": severity, **row} for row in view_rows]
-            images[ladder] = radiance
         return rows, images
 
     def _changed(self, suite: str, method: Method | None) -> Iterator[tuple[str, int, list[Batch]]]:
@@ -102,13 +101,11 @@ class SuiteViews:
         for judged in evaluate(method, [self._with_traced(method, batch) for batch in batches], metrics):
             batch = judged.batch
             error = relative_error(judged.radiance, batch["reference_a"], batch["reference_b"], batch["exposure"])
-            columns = {"error": error, "nonfinite": judged.nonfinite}
+            columns = {"scene": batch["scene"], "view": torch.arange(len(error)), "error": error}
+            columns |= {"nonfinite": judged.nonfinite}
             columns |= {name: judged.metrics[name] for name in ("unbiased_mse", "mse", "mssim")}
-            values = {name: column.tolist() for name, column in columns.items()}
-            rows += [
-                {"scene": int(batch["scene"][k]), "view": k, **{name: column[k] for name, column in values.items()}}
-                for k in range(len(judged.radiance))
-            ]
+            views = zip(*(column.tolist() for column in columns.values()), strict=True)
+            rows += [dict(zip(columns, values, strict=True)) for values in views]
             images.append(judged.radiance.float().cpu().numpy())
         return rows, np.concatenate(images)
 
@@ -126,8 +123,6 @@ class SuiteViews:
             batch = batch | {"traced": batch[name]}
         return batch
 
-    # --- flicker ---
-
     def _flicker(self, method: Method) -> list[dict[str, Any]]:
         """Return a method's rows of the suite flicker.
 
@@ -135,20 +130,28 @@ class SuiteViews:
         a path is the mean square change from frame to frame, relative to the reference's.
         """
         rows = []
-        for scene, clean in enumerate(self.clean):
+        for clean_set in (view_set for view_set in self.view_sets if view_set.suite == CLEAN):
+            scene, clean = clean_set.scene, self.batch(clean_set)
             mine = [view_set for view_set in self.view_sets if (view_set.suite, view_set.scene) == (FLICKER, scene)]
-            draws = [view_set for view_set in mine if view_set.ladder == DRAWS]
             a, b = (expose(clean[f"reference_{half}"].double(), clean["exposure"]) for half in "ab")
             scale = (a * b).mean().item()
             row = lambda kind, value, images, scene=scene: {
                 "ladder": kind, "severity": 0, "scene": scene, "value": value,
                 "nonfinite": int((~images.isfinite()).sum()),
             }  # fmt: skip
-            for kind in ("points", "photons", "noise"):
-                if _reads(method, kind):
-                    predictions = (self._with_drawn(method, clean, draw, kind) for draw in draws)
-                    images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
-                    rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
+            for kind in (kind for kind in ("points", "photons", "noise") if _reads(method, kind)):
+                predictions = []
+                for draw in (view_set for view_set in mine if view_set.ladder == DRAWS):
+                    if kind == "points":
+                        before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
+                        moved = _with_nearest_embeddings(method, scene, before, after)
+                        predictions.append(self.predict(moved, self._batch(clean_set, after)))
+                    else:
+                        prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
+                        drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
+                        predictions.append(self.predict(method, clean | drawn))
+                images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
+                rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
             for view_set in (view_set for view_set in mine if view_set.is_path):
                 frames = self.batch(view_set)
                 own, a, b = (
@@ -157,16 +160,6 @@ class SuiteViews:
                 )
                 rows.append(row(view_set.ladder, (own.square().mean() / (a * b).mean()).item(), own))
         return rows
-
-    def _with_drawn(self, method: Method, clean: Batch, draw: ViewSet, kind: str) -> Tensor:
-        """Predict the clean views with another draw of points, photons or input noise."""
-        if kind != "points":
-            prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
-            drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
-            return self.predict(method, clean | drawn)
-        clean_set = next(s for s in self.view_sets if (s.suite, s.scene) == (CLEAN, draw.scene))
-        before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
-        return self.predict(_with_nearest_embeddings(method, draw.scene, before, after), self._batch(clean_set, after))
 
 
 def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Method:

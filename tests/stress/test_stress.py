@@ -27,12 +27,11 @@ from nlt.models.projection import visible_pixels
 from nlt.paths import CONFIGS
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES, ChangedScene
-from nlt.stress.figures import stress_section
 from nlt.stress.inputs import BUDGET, FRAME
 from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
+from nlt.stress.report import breaking_point, stress_section
 from nlt.stress.suites import load_suites
-from nlt.stress.tables import breaking_point
 
 pytestmark = pytest.mark.slow
 

@@ -1,4 +1,4 @@
-"""The tables and sentences of the stress suites, made from their rows alone."""
+"""The report section of the stress suites: sentences, tables and figures, made from their rows alone."""
 
 from __future__ import annotations
 
@@ -8,18 +8,26 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
 
+from nlt.data.files import write_bytes
 from nlt.evaluation.paper import label, order
-from nlt.evaluation.results import MANIFEST, OK, read_rows
-from nlt.report.table_writer import Table
-from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED
+from nlt.evaluation.results import MANIFEST, OK, Results, read_rows, write_rows
+from nlt.report import plots
+from nlt.report.page import Section
+from nlt.report.table_writer import Table, section
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED, ROWS, STRESS, TRAININGS
 
-STRESS, ROWS, TRAININGS, BREAKING, TEXT = "stress", "stress.csv", "training.csv", "breaking.csv", "stress.md"
+BREAKING, TEXT = "breaking.csv", "stress.md"
 DOUBLED = 2.0  # growth over the clean error at which a method breaks
+_CEILING = 1e3  # growth at which curves are clipped
+_ACROSS = 6  # panels of curves in a row
+_WORST = 8  # rows of the gallery
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
 _NONE = "–"
 Row = dict[str, Any]
@@ -116,7 +124,29 @@ def breaking_point(growth: np.ndarray) -> float:
     return math.inf
 
 
-def breaking_rows(stressed: Stressed) -> list[Row]:
+def stress_section(results: Path) -> Section | None:
+    """Write tables and figures of a comparison's stress results and return their report section; None without them."""
+    stressed = Stressed.load(results / STRESS)
+    if stressed is None:
+        return None
+    directory = stressed.directory
+    paragraphs = [_introduction(stressed), *(_about(stressed, method) for method in stressed.methods)]
+    tables = _tables(stressed)
+    lines = ["# Where methods fail", "", *(line for paragraph in paragraphs for line in (paragraph, ""))]
+    lines += [line for table in tables for line in section(table)]
+    lines += [f"Where the numbers come from: {MANIFEST}, {ROWS}, {TRAININGS}, {BREAKING}.", ""]
+    write_bytes(directory / TEXT, "\n".join(lines).encode())
+    write_rows(directory / BREAKING, _breaking_rows(stressed))
+    if stressed.errors:
+        _draw_curves(stressed)
+        _draw_map(stressed)
+        _draw_worst(stressed)
+    files = (ROWS, BREAKING, TRAININGS, TEXT, MANIFEST)
+    source = f"{STRESS}/{BREAKING}, {ROWS}, {TRAININGS}"
+    return Section(STRESS, "Where methods fail", paragraphs, tables, directory, files, source)
+
+
+def _breaking_rows(stressed: Stressed) -> list[Row]:
     """Return the rows of breaking.csv, by method and ladder: errors, growth and ranks by severity, breaking point."""
     rows = []
     for ladder, errors in stressed.errors.items():
@@ -129,7 +159,7 @@ def breaking_rows(stressed: Stressed) -> list[Row]:
     return rows
 
 
-def introduction(stressed: Stressed) -> str:
+def _introduction(stressed: Stressed) -> str:
     """Return a paragraph on the measurement and the parts left out."""
     manifest = stressed.manifest
     return (
@@ -142,7 +172,7 @@ def introduction(stressed: Stressed) -> str:
     )
 
 
-def about(stressed: Stressed, method: str) -> str:
+def _about(stressed: Stressed, method: str) -> str:
     """Return a Markdown paragraph: where and how much a method breaks, which is better there, what it withstands."""
     points = {ladder: own[method] for ladder, own in stressed.breaks.items() if method in own}
     broken = sorted((at, ladder) for ladder, at in points.items() if math.isfinite(at))
@@ -171,7 +201,7 @@ def about(stressed: Stressed, method: str) -> str:
     return " ".join(parts)
 
 
-def tables(stressed: Stressed) -> list[Table]:
+def _tables(stressed: Stressed) -> list[Table]:
     """Return the tables of breaking points, ranks, flicker and trainings, without empty ones."""
     methods = stressed.methods
     points, ranks, flicker = [], [], []
@@ -192,10 +222,10 @@ def tables(stressed: Stressed) -> list[Table]:
         "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
         "square change from frame to frame on a smooth path, over the reference's."
     )
-    best = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
+    rank_columns = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
     all_tables = [
         Table("Breaking points", note, [label(method) for method in methods], points, first="ladder"),
-        Table("Ranks", "", best, ranks, first="ladder"),
+        Table("Ranks", "", rank_columns, ranks, first="ladder"),
         Table("Flicker", flicker_note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], flicker),
         _trainings(stressed),
     ]
@@ -227,3 +257,79 @@ def _trainings(stressed: Stressed) -> Table:
 
 def _number(value: float, form: str = ".3g") -> str:
     return format(value, form) if math.isfinite(value) else _NONE
+
+
+def _draw_curves(stressed: Stressed) -> None:
+    """Draw stress_curves: the growth of the error over severity, one panel per ladder, on one scale."""
+    rows = math.ceil(len(stressed.errors) / _ACROSS)
+    size = (2.4 * _ACROSS, 2 * rows + 0.6)
+    figure, axes = plt.subplots(
+        rows, _ACROSS, figsize=size, squeeze=False, sharex=True, sharey=True, layout="constrained"
+    )
+    for axis, (ladder, errors) in zip(axes.flat, stressed.errors.items(), strict=False):
+        for method, own in errors.items():
+            k = stressed.methods.index(method)
+            look = {**plots.style(k), "ls": plots.DASHES[k // len(plots.COLOURS) % len(plots.DASHES)]}
+            axis.plot(np.clip(own / own[0], 1 / DOUBLED**2, _CEILING), lw=1, ms=3, label=label(method), **look)
+        axis.axhline(DOUBLED, color="0.6", lw=0.8, ls=":")
+        axis.set_title(stressed.title(ladder), fontsize=6.5)
+        axis.set(yscale="log", xticks=range(6))
+        axis.tick_params(labelsize=7, labelbottom=True)
+    figure.supylabel("error over clean error, by severity", fontsize=8)
+    plots.add_legend(figure, 7, "outside lower center")
+    plots.save(figure, stressed.directory, "stress_curves")
+
+
+def _draw_map(stressed: Stressed) -> None:
+    """Draw stress_map: each method's breaking point on each ladder; darker is earlier, blank is not affected."""
+    ladders, methods = list(stressed.breaks), stressed.methods
+    size = (2.6 + 0.55 * len(methods), 1.4 + 0.22 * len(ladders))
+    figure, axis = plt.subplots(figsize=size, layout="constrained")
+    points = np.full((len(ladders), len(methods)), np.nan)
+    for row, ladder in enumerate(ladders):
+        for method, at in stressed.breaks[ladder].items():
+            column, text = methods.index(method), stressed.break_text(ladder, method)
+            points[row, column] = min(at, 5.5)
+            axis.text(column, row, text, ha="center", va="center", fontsize=6.5, color="white" if at < 3 else "black")
+    axis.imshow(points, cmap="cividis", vmin=0, vmax=5.5, aspect="auto")
+    axis.set_xticks(range(len(methods)), map(label, methods), rotation=40, ha="right", fontsize=7)
+    axis.set_yticks(range(len(ladders)), map(stressed.title, ladders), fontsize=7)
+    axis.set_title("Severity at which the error doubles", fontsize=8)
+    axis.grid(False)
+    plots.save(figure, stressed.directory, "stress_map")
+
+
+def _draw_worst(stressed: Stressed) -> None:
+    """Draw stress_worst: the views whose error grew most at a ladder's highest severity, by reference and every method.
+
+    The method whose error grew most is framed.
+    """
+    worst_of_ladders = [
+        max(
+            (row["error"] / own[0], ladder, place, method)
+            for method, own in errors.items()
+            for place, row in enumerate(stressed.views(method, ladder, len(own) - 1))
+        )
+        for ladder, errors in stressed.errors.items()
+        if ladder[0] in RENDERED
+    ]
+    picked = sorted(worst_of_ladders, reverse=True)[:_WORST]
+    suites, names = {suite for _, (suite, _), _, _ in picked}, ("reference", *stressed.methods)
+    results = Results(stressed.directory, stressed.manifest, [], [])
+    stored = {(suite, name): results.images(f"{suite}-{name}") or {} for suite in suites for name in names}
+    columns = [name for name in names if all(stored[suite, name] for suite in suites)]
+    if not picked or "reference" not in columns:
+        return  # images exist only on the machine that made them
+    figure, axes = plots.grid(len(picked), ["Reference", *map(label, columns[1:])])
+    for row, (growth, (suite, ladder), place, worst) in zip(axes, picked, strict=True):
+        exposure = stored[suite, "reference"]["exposure"][place]
+        for axis, name in zip(row, columns, strict=True):
+            axis.imshow(plots.shown(stored[suite, name][ladder][place], exposure))
+            if name == worst:
+                frame = {"fill": False, "ec": plots.COLOURS[1], "lw": 4, "transform": axis.transAxes}
+                axis.add_patch(plt.Rectangle((0, 0), 1, 1, **frame))
+        row[0].text(
+            0.02, 0.03, f"{fill(stressed.says((suite, ladder)), 18)}\n{growth:.3g}x", transform=row[0].transAxes,
+            fontsize=6, color="white", bbox={"facecolor": "black", "alpha": 0.6, "pad": 1, "lw": 0},
+        )  # fmt: skip
+    plots.save(figure, stressed.directory, "stress_worst", plots.PICTURE)
