@@ -86,13 +86,11 @@ class Search:
         self._most, self._batch_size = config["trainer"]["max_steps"], config["data"].get("batch_size", 32)
         self._epoch = max(1, len(space.spec.scenes) * space.spec.train // self._batch_size)
 
-    # --- the plan ---
-
-    def plan(self) -> None:
-        """Measure the candidates' costs, and decide the rounds and how many candidates fit into the budget.
+    def run(self) -> list[Candidate]:
+        """Return the candidates trained longest, all for the same steps and with scores for all `seeds`.
 
         Raises:
-            UserError: the budget is too small for two candidates.
+            UserError: the budget is too small for two candidates, or all of them diverge.
         """
         plan = _stored(self.directory / "plan.json", self._plan)
         self.rounds, self.spent = plan["rungs"], plan["spent_s"]
@@ -101,12 +99,36 @@ class Search:
         self.entries = {candidate: Entry(cost) for candidate, cost in costs.items()}
         order = list(self.entries)
         fit = max((n for n in range(2, len(order) + 1) if self._fits(order, n, self.rounds)), default=2)
-        counts = zip(self._counts(self.rounds, fit), self.rounds, strict=True)
-        rounds = ", ".join(f"{n} for {steps} steps" for n, steps in counts)
+        counts = self._counts(self.rounds, fit)
+        said = ", ".join(f"{n} for {steps} steps" for n, steps in zip(counts, self.rounds, strict=True))
         seeds = f", the last with {self.space.seeds} seeds" if self.space.seeds > 1 else ""
         total = (self.spent + self._cost(order[:fit], self.rounds)) / 60
-        print(f"{fit} of {len(self.space.candidates)} candidates fit into {self.space.minutes:g} min: {rounds}{seeds}; "
+        print(f"{fit} of {len(self.space.candidates)} candidates fit into {self.space.minutes:g} min: {said}{seeds}; "
               f"about {total:.1f} min in all", flush=True)  # fmt: skip
+
+        finals = self._round(0, order)
+        if not finals:
+            raise UserError(f"{self.space.scale}: every candidate diverged; lower model.init_args.learning_rate")
+        counts = self._counts(self.rounds, len(finals))
+        for k in range(1, len(self.rounds)):
+            order, keep = self._order(finals), counts[k]
+            while keep > 1 and self.spent + self._cost(order[:keep], self.rounds, k) > self.budget:
+                keep -= 1
+            for candidate in order[keep:]:
+                self.entries[candidate].status = f"dropped after {self.rounds[k - 1]} steps"
+            finals = self._round(k, order[:keep]) or finals
+        while (last := self.rounds[-1]) < self._most:  # there is more time than was planned
+            rounds = [*self.rounds, min(_ETA * last, self._most // self._epoch * self._epoch)]
+            if rounds[-1] == last or self.spent + self._cost(finals, rounds, len(self.rounds)) > self.budget:
+                break
+            self.rounds = rounds
+            finals = self._round(len(rounds) - 1, self._order(finals)) or finals
+        finals = self._more_seeds(finals)
+        for candidate in finals:
+            self.entries[candidate].status = "trained to the end"
+        return finals
+
+    # --- the plan ---
 
     def _plan(self) -> dict[str, Any]:
         """Return the rounds' steps and every candidate's cost per step and, with interleaved timing, per frame."""
@@ -184,31 +206,6 @@ class Search:
         return self.spent - paid + self._cost(order[:first], rounds) <= self.budget
 
     # --- the search ---
-
-    def run(self) -> list[Candidate]:
-        """Return the candidates trained longest, all for the same steps and with scores for all `seeds`."""
-        self.plan()
-        finals = self._round(0, list(self.entries))
-        if not finals:
-            raise UserError(f"{self.space.scale}: every candidate diverged; lower model.init_args.learning_rate")
-        counts = self._counts(self.rounds, len(finals))
-        for k in range(1, len(self.rounds)):
-            order, keep = self._order(finals), counts[k]
-            while keep > 1 and self.spent + self._cost(order[:keep], self.rounds, k) > self.budget:
-                keep -= 1
-            for candidate in order[keep:]:
-                self.entries[candidate].status = f"dropped after {self.rounds[k - 1]} steps"
-            finals = self._round(k, order[:keep]) or finals
-        while (last := self.rounds[-1]) < self._most:  # there is more time than was planned
-            rounds = [*self.rounds, min(_ETA * last, self._most // self._epoch * self._epoch)]
-            if rounds[-1] == last or self.spent + self._cost(finals, rounds, len(self.rounds)) > self.budget:
-                break
-            self.rounds = rounds
-            finals = self._round(len(rounds) - 1, self._order(finals)) or finals
-        finals = self._more_seeds(finals)
-        for candidate in finals:
-            self.entries[candidate].status = "trained to the end"
-        return finals
 
     def _round(self, k: int, order: list[Candidate]) -> list[Candidate]:
         """Train candidates to the end of round `k` while there is time; return those that did not diverge."""

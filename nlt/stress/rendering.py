@@ -1,4 +1,4 @@
-"""Rendering and reading the stress suites of a dataset, in a file per ladder, severity and scene."""
+"""Rendering of the stress suites of a dataset, in a file per ladder, severity and scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import SampleTensors, collate
+from nlt.data.dataset import SampleTensors
 from nlt.data.engines import Local, available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import Points, ShardReader, points_name, read_points, write_shard
+from nlt.data.store import points_name, read_points, write_shard
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 from nlt.scenes.assembly import Scene
@@ -165,15 +163,3 @@ def _render(
             cloud = perturber.lit_points()
         write_shard(directory / view_set.points_name, [cloud])
         write_shard(directory / view_set.name, samples)
-
-
-def read_views(
-    directory: AnyPath, spec: DatasetSpec, suites: Suites, view_set: ViewSet, points: Points | None = None
-) -> dict[str, Tensor]:
-    """Read the views of a set as a batch, with its `path_traced` images. `points` replaces the set's points."""
-    names, reader = [*view_set.fields(spec), *view_set.path_traced(suites)], ShardReader()
-    views = [reader.read(directory / view_set.name, k, names) for k in range(view_set.views)]
-    if view_set.ladder == DRAWS:
-        return collate([{name: torch.from_numpy(array) for name, array in view.items()} for view in views])
-    tensors = SampleTensors(spec, {view_set.scene: points or read_points(directory / view_set.points_name)})
-    return collate([tensors(view_set.scene, view, k) for k, view in enumerate(views)])

@@ -55,14 +55,9 @@ class Stressed:
     def methods(self) -> list[str]:
         return sorted({row["method"] for row in self.rows}, key=order)
 
-    @property
-    def suites(self) -> dict[str, Any]:
-        """The content of the suites' config."""
-        return self.manifest["manifest"]
-
     def says(self, ladder: Ladder) -> str:
         """Return what a ladder changes."""
-        return str(self.suites[ladder[0]][ladder[1]]["says"])
+        return str(self.manifest["manifest"][ladder[0]][ladder[1]]["says"])
 
     def title(self, ladder: Ladder) -> str:
         return f"{ladder[0]}: {self.says(ladder)}"
@@ -94,11 +89,10 @@ class Stressed:
         A negative estimate, which an unbiased one may be, counts as zero. Ladders without rows are left out.
         """
         errors: dict[Ladder, dict[str, np.ndarray]] = {}
-        ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.suites[suite]]
+        ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
         for ladder, method in itertools.product(ladders, self.methods):
-            severities = [k for k in range(1, 6) if self.views(method, ladder, k)]
-            if severities:
-                means = [max(self.mean(method, ladder, k), 0.0) for k in severities]
+            means = [max(self.mean(method, ladder, k), 0.0) for k in range(1, 6) if self.views(method, ladder, k)]
+            if means:
                 errors.setdefault(ladder, {})[method] = np.array([self.clean(method), *means])
         return errors
 
@@ -165,7 +159,7 @@ def _introduction(stressed: Stressed) -> str:
     return (
         f"`{manifest['command']}`, commit {str(manifest['commit'])[:12]}: at each severity "
         f"{manifest['views']} of each scene's views ({', '.join(manifest['scenes'])}), "
-        f"suites of version {stressed.suites['version']}. "
+        f"suites of version {manifest['manifest']['version']}. "
         "Errors are squared, relative to the reference's square (plus 0.01) at each pixel, without the reference's "
         "noise; a method breaks where its error is twice that of the clean views."
         + (f" Left out: {'; '.join(manifest['left_out'])}." if manifest["left_out"] else "")
@@ -247,7 +241,7 @@ def _trainings(stressed: Stressed) -> Table:
         outcomes = [own.get(kind, {"status": _NONE}) for kind in kinds]
         cells.append([label(method), spread + lost])
         cells[-1] += [_number(row["error"]) if row["status"] == OK else row["status"] for row in outcomes]
-    content = stressed.suites["training"]
+    content = stressed.manifest["manifest"]["training"]
     note = (
         f"Trained anew for {content['share']:.0%} of the steps: the error over {content['seeds']} seeds "
         "(mean ± standard deviation), and that of one seed with a change."

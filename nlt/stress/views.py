@@ -13,9 +13,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import Points, read_points
+from nlt.data.store import Points, ShardReader, read_points
 from nlt.display import expose
 from nlt.errors import UserError
 from nlt.evaluation.evaluate import evaluate
@@ -23,7 +24,7 @@ from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.transport import PointEmbedding
 from nlt.stress.inputs import BUDGET, FRAME
-from nlt.stress.rendering import DRAWS, ViewSet, read_views
+from nlt.stress.rendering import DRAWS, ViewSet
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
 
 
@@ -41,9 +42,16 @@ class SuiteViews:
         self.batch = cache(self._batch)
 
     def _batch(self, view_set: ViewSet, points: Points | None = None) -> Batch:
-        """Return the views of a set, with its own points or with others."""
-        batch = read_views(self.directory, self.spec, self.suites, view_set, points)
-        return {name: value.to(self.device) for name, value in batch.items()}
+        """Return the views of a set, with its `path_traced` images and with its own points or with others."""
+        names, reader = [*view_set.fields(self.spec), *view_set.path_traced(self.suites)], ShardReader()
+        stored = [reader.read(self.directory / view_set.name, k, names) for k in range(view_set.views)]
+        if view_set.ladder == DRAWS:
+            views = [{name: torch.from_numpy(array) for name, array in view.items()} for view in stored]
+        else:
+            points = points or read_points(self.directory / view_set.points_name)
+            tensors = SampleTensors(self.spec, {view_set.scene: points})
+            views = [tensors(view_set.scene, view, k) for k, view in enumerate(stored)]
+        return {name: value.to(self.device) for name, value in collate(views).items()}
 
     @property
     def clean(self) -> list[Batch]:
