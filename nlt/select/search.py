@@ -231,9 +231,9 @@ class Search:
         for seed in range(1, self.space.seeds):
             left, done = list(finals), list[Candidate]()
             while left and self.spent + sum(self._estimate(c, steps) for c in left) <= self.budget:
-                if self.train(left[0], seed, steps, 0):
-                    done.append(left[0])
-                del left[0]
+                candidate = left.pop(0)
+                if self.train(candidate, seed, steps, 0):
+                    done.append(candidate)
             print(f"seed {seed}: {len(done)} of {len(finals)} candidates; "
                   f"{(self.budget - self.spent) / 60:.1f} of {self.space.minutes:g} min left", flush=True)  # fmt: skip
             if left or not done:
