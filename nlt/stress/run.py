@@ -29,7 +29,7 @@ from nlt.models.method import Method
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES
-from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.inputs import INPUTS
 from nlt.stress.perturber import PLACES, lacks
 from nlt.stress.rendering import render_suites, view_sets
 from nlt.stress.report import stress_section
@@ -70,7 +70,7 @@ def stress(
         raise UserError(f"{comparison.scale}: data.dataset.test: must be at least 1: the suites change test samples")
     check(comparison)
     for (suite, name), ladder in content.ladders.items():
-        known = {**BUDGET, **FRAME} if suite in COMPUTED else {**MESHES, **PLACES}
+        known = INPUTS if suite in COMPUTED else {**MESHES, **PLACES}
         if ladder.change not in known:
             place = f"{content.file}: {suite}.{name}.change"
             raise UserError(f"{place}: must be one of {', '.join(known)}, is {ladder.change!r}")

@@ -23,7 +23,7 @@ from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.transport import PointEmbedding
-from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.inputs import INPUTS
 from nlt.stress.rendering import DRAWS, ViewSet
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
 
@@ -84,23 +84,20 @@ class SuiteViews:
             for name, severity in dict.fromkeys((view_set.ladder, view_set.severity) for view_set in mine):
                 yield name, severity, [self.batch(s) for s in mine if (s.ladder, s.severity) == (name, severity)]
             return
+        frames = [(scene.up, scene.camera.mean(0)) for scene in self.spec.descriptions]
         hparams: dict[str, Any] = getattr(method, "hparams", {})
         own = dict(hparams)  # to be restored after the denoisers are given another number of pixels
         for (owner, name), ladder in self.suites.ladders.items():
             if owner == suite and (method is None or _reads(method, ladder.change)):
+                change = INPUTS[ladder.change]
                 try:
                     for severity, value in enumerate(ladder.values, 1):
                         if ladder.change == "pixels":
                             hparams["one_in"] = value
-                        yield name, severity, [self._compute(batch, ladder.change, value) for batch in self.clean]
+                        scenes = zip(self.clean, frames, strict=True)
+                        yield name, severity, [change(batch, value, *frame) for batch, frame in scenes]
                 finally:
                     hparams.update(own)
-
-    def _compute(self, batch: Batch, change: str, value: float) -> Batch:
-        if change in BUDGET:
-            return BUDGET[change](batch, value)
-        description = self.spec.descriptions[int(batch["scene"][0])]
-        return FRAME[change](batch, value, description.up, description.camera.mean(0))
 
     def rows(self, method: Method, batches: list[Batch]) -> tuple[list[dict[str, Any]], np.ndarray]:
         """Return a row per view, and the radiance (V, 3, H, W), 0 where it is not finite."""
