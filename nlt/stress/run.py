@@ -133,9 +133,10 @@ def _judge(
     left_out: list[str],
     write_record: Callable[[], None],
 ) -> list[dict[str, Any]]:
-    """Judge methods, by name with their training's, on suites; return the rows of stress.csv.
+    """Judge methods on suites, write their rows and images, and return all rows of stress.csv.
 
-    What is complete already is kept. A method that has diverged, so that `build` raises, is added to `left_out`.
+    `labels` has the name of each method's training; results of that training are kept. A method that has diverged, so
+    that `build` raises, is added to `left_out`.
     """
     path, rendered = directory / ROWS, views.directory.name
     rows: dict[tuple[str, str], list[dict[str, Any]]] = {}  # by method and suite
