@@ -128,7 +128,7 @@ def _report(options: argparse.Namespace) -> None:
 
 def _draw(directory: str | Path, megabytes: int | None = None) -> None:
     from nlt.report.draw import draw
-    from nlt.stress.figures import stress_section
+    from nlt.stress.report import stress_section
 
     draw(directory, megabytes, [stress_section])
 

@@ -19,6 +19,7 @@ from nlt.data.spec import DatasetSpec
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
 from nlt.rendering.variant import choose_variant
+from nlt.report.table_writer import grid
 from nlt.scenes.assembly import Scene
 
 _VIEWS = 16
@@ -30,23 +31,14 @@ _FIELDS = ("depth", "normal", "camera_matrix", "world_to_view", "translation", "
 
 @dataclass(frozen=True)
 class Facts:
-    """The properties of a scene in an experiment that decide what a model of it needs.
-
-    Attributes:
-        scene: name of the scene.
-        moving: names of the objects that states move or remove.
-        moving_lights: names of those among them that emit light.
-        materials: share of each of `MATERIALS` in the visible surface, where it is above zero.
-        point_coverage: by N, the share of the pixels with a surface in which at least one of N points is visible.
-        photon_coverage: the same by P, for P photons.
-    """
+    """The properties of a scene in an experiment that decide what a model of it needs."""
 
     scene: str
-    moving: tuple[str, ...]
-    moving_lights: tuple[str, ...]
-    materials: dict[str, float]
-    point_coverage: dict[int, float]
-    photon_coverage: dict[int, float]
+    moving: tuple[str, ...]  # the objects that states move or remove
+    moving_lights: tuple[str, ...]  # those among them that emit light
+    materials: dict[str, float]  # share of each of `MATERIALS` in the visible surface, where it is above zero
+    point_coverage: dict[int, float]  # by N, the share of the pixels with a surface that show at least one of N points
+    photon_coverage: dict[int, float]  # the same for photons
 
 
 @dataclass(frozen=True)
@@ -122,17 +114,9 @@ def enough(curve: dict[int, float]) -> int:
 
 def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
     """Return what a model of a dataset needs, which is what any of its scenes needs."""
-    return [
-        _transport(facts),
-        _view_direction(facts),
-        _count("points", spec.num_points, [fact.point_coverage for fact in facts]),
-        _count("photons", spec.num_photons, [fact.photon_coverage for fact in facts]),
-    ]
-
-
-def _transport(facts: list[Facts]) -> Advice:
-    lights = _some([name for fact in facts for name in fact.moving_lights])
-    moving = _some([name for fact in facts for name in fact.moving])
+    listed = lambda names: ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    lights = listed(list(dict.fromkeys(name for fact in facts for name in fact.moving_lights)))
+    moving = listed(list(dict.fromkeys(name for fact in facts for name in fact.moving)))
     if lights:
         kind, methods = "photons", ["nlt_photons", "photon_splat"]
         reason = f"lights move or are removed: {lights}; photons say where light arrives in each state"
@@ -142,17 +126,20 @@ def _transport(facts: list[Facts]) -> Advice:
     else:
         kind, methods = "none", ["feature_projection", "cnn"]
         reason = "nothing moves: the light leaving a point is always the same, so its feature or the U-Net can store it"
-    return Advice("light transport", f"{kind}: {', '.join(methods)}", reason, methods)
+    transport = Advice("light transport", f"{kind}: {', '.join(methods)}", reason, methods)
 
-
-def _view_direction(facts: list[Facts]) -> Advice:
     shares = {name: float(np.mean([fact.materials.get(name, 0) for fact in facts])) for name in MATERIALS}
-    specular = {name: share for name, share in shares.items() if share and name != "diffuse"}
+    specular = [f"{name} {share:.2%}" for name, share in shares.items() if share and name != "diffuse"]
+    verdict, reason = "needed", f"shares of the visible surface: {', '.join(specular)}"
     if not specular:
+        verdict = "not needed: ablation without ray_direction"
         reason = "every surface is diffuse: it looks the same from every direction"
-        return Advice("view direction", "not needed: ablation without ray_direction", reason)
-    listed = ", ".join(f"{name} {share:.2%}" for name, share in specular.items())
-    return Advice("view direction", "needed", f"shares of the visible surface: {listed}")
+    return [
+        transport,
+        Advice("view direction", verdict, reason),
+        _count("points", spec.num_points, [fact.point_coverage for fact in facts]),
+        _count("photons", spec.num_photons, [fact.photon_coverage for fact in facts]),
+    ]
 
 
 def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
@@ -165,18 +152,13 @@ def _count(what: str, count: int, curves: list[dict[int, float]]) -> Advice:
     return Advice(what, f"{best:,} of {count:,}" if best < count else f"all {count:,}", f"{held}; {more}")
 
 
-def _some(names: list[str]) -> str:
-    names = list(dict.fromkeys(names))
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
 def table(advice: list[Advice], facts: list[Facts]) -> str:
     """Return the advice with its reasons and the coverage behind it, as Markdown."""
-    lines = ["# What varies", "", "| | needs | because |", "|---|---|---|"]
-    lines += [f"| {item.subject} | {item.verdict} | {item.reason} |" for item in advice]
+    lines = ["# What varies", "", *(f"- **{item.subject}**: {item.verdict} ({item.reason})" for item in advice)]
     lines += ["", "Share of the pixels with a surface that hold at least one of so many, mean over random views:", ""]
-    lines += [f"| | {' | '.join(f'{n:,}' for n in _COUNTS)} |", "|---|" + "---:|" * len(_COUNTS)]
-    for fact in facts:
-        for name, curve in (("points", fact.point_coverage), ("photons", fact.photon_coverage)):
-            lines.append(f"| {fact.scene}: {name} | " + " | ".join(f"{curve[n]:.0%}" for n in _COUNTS) + " |")
-    return "\n".join(lines) + "\n"
+    rows = [
+        [f"{fact.scene}: {name}", *(f"{curve[n]:.0%}" for n in _COUNTS)]
+        for fact in facts
+        for name, curve in (("points", fact.point_coverage), ("photons", fact.photon_coverage))
+    ]
+    return "\n".join([*lines, *grid(["", *(f"{n:,}" for n in _COUNTS)], rows)])

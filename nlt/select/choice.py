@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+from scipy.stats import rankdata
 
 Key = TypeVar("Key")
 Errors = Mapping[Key, np.ndarray]
@@ -63,16 +64,12 @@ def ranked(metrics: Sequence[Errors[Key]], cost: Mapping[Key, float]) -> list[Ke
     least as good; the next front those that only the first one beats, and so on. Within a front, candidates are ordered
     by the sum of their ranks in the metrics.
     """
-    means = {key: tuple(float(errors[key].mean()) for errors in metrics) for key in metrics[0]}
-    ranks = {key: sum(sorted(m[k] for m in means.values()).index(v) for k, v in enumerate(means[key])) for key in means}
-    left, order = list(means), list[Key]()
+    points = {key: (cost[key], *(float(errors[key].mean()) for errors in metrics)) for key in metrics[0]}
+    ranks = dict(zip(points, rankdata(list(points.values()), axis=0, method="min")[:, 1:].sum(1), strict=True))
+    beats = lambda one, other: one != other and all(a <= b for a, b in zip(one, other, strict=True))
+    left, order = list(points), list[Key]()
     while left:
-        front = [key for key in left if not any(_beats(other, key, means, cost) for other in left)]
+        front = [key for key in left if not any(beats(points[other], points[key]) for other in left)]
         order += sorted(front, key=lambda key: (ranks[key], cost[key]))
         left = [key for key in left if key not in front]
     return order
-
-
-def _beats(one: Key, other: Key, means: Mapping[Key, tuple[float, ...]], cost: Mapping[Key, float]) -> bool:
-    ours, theirs = (cost[one], *means[one]), (cost[other], *means[other])
-    return ours != theirs and all(a <= b for a, b in zip(ours, theirs, strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -19,9 +19,8 @@ from nlt.metrics.quantities import COSTS
 from nlt.select import advice
 from nlt.select.choice import best, choose, paired_difference
 from nlt.select.output import draw_front, markdown
-from nlt.select.search import Search
+from nlt.select.search import SCORES, Search, as_errors
 from nlt.select.space import Candidate, SearchSpace
-from nlt.select.trials import SCORES, as_error
 from nlt.waiting import wait_passively
 
 Row = dict[str, Any]
@@ -63,10 +62,16 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
         del picks[FULL]
     confirmed = _confirm(search, picks)
     rows = _rows(search, finals, picks[CHOSEN])
-    write_bytes(directory / "chosen.yaml", _chosen(space, picks[CHOSEN]).encode())
+    head = f"# {picks[CHOSEN].name}: chosen by `nlt select --config {space.name}`, ready for `nlt fit --config`.\n"
+    config = yaml.safe_dump(space.config(picks[CHOSEN]), sort_keys=False)
+    write_bytes(directory / "chosen.yaml", (head + config).encode())
     write_rows(directory / "table.csv", rows)
     write_rows(directory / "confirmed.csv", confirmed)
-    write_rows(directory / "views.csv", _views(search, finals))
+    views = []
+    for c, seed in itertools.product(finals, search.seeds):
+        for view, values in enumerate(zip(*(search.entries[c].scores[seed][key] for key in SCORES), strict=True)):
+            views.append({"candidate": c.name, "seed": seed, "view": view, **dict(zip(SCORES, values, strict=True))})
+    write_rows(directory / "views.csv", views)
     record = {
         **begun,
         **surroundings(search.device, search.policy),
@@ -91,11 +96,6 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     return directory
 
 
-def _chosen(space: SearchSpace, candidate: Candidate) -> str:
-    head = f"# {candidate.name}: chosen by `nlt select --config {space.name}`, ready for `nlt fit --config`.\n"
-    return head + yaml.safe_dump(space.config(candidate), sort_keys=False)
-
-
 def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Row]:
     """Return a row per candidate of the space: validation scores, and paired differences from the best."""
     errors = {key: search.errors(finals, key) for key in SCORES}
@@ -108,8 +108,7 @@ def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Ro
             row |= {"status": entry.status, "steps": entry.steps, "seeds": len(seeds)}
             row |= {key: entry.cost[key] for key in ("step_s", *COSTS, "time_per_frame_error_s") if key in entry.cost}
             for key in SCORES if entry.steps else ():
-                scores = search.scores(candidate, key, seeds)
-                row[key] = scores.mean()
+                row[key] = np.mean([entry.scores[seed][key] for seed in seeds])
                 if candidate in finals:
                     behind = paired_difference(errors[key][candidate], errors[key][best(errors[key])])
                     row[f"{key}_behind"], row[f"{key}_behind_error"] = behind
@@ -119,33 +118,14 @@ def _rows(search: Search, finals: list[Candidate], chosen: Candidate) -> list[Ro
 
 def _confirm(search: Search, picks: dict[str, Candidate]) -> list[Row]:
     """Return the picks' scores on the unused test split, and paired differences from the full model."""
-    scores_of = {c: [_test_scores(search, c, seed) for seed in search.seeds] for c in set(picks.values())}
+    scores = {candidate: search.test_scores(candidate) for candidate in set(picks.values())}
     rows = []
     for role, candidate in picks.items():
         row: Row = {"role": role, "candidate": candidate.name} | search.entries[candidate].cost
         for key in SCORES:
-            errors = {c: as_error(key, np.array([scores[key] for scores in seeds])) for c, seeds in scores_of.items()}
-            row[key] = float(np.mean([scores[key] for scores in scores_of[candidate]]))
+            row[key] = float(np.mean([of_seed[key] for of_seed in scores[candidate]]))
             if FULL in picks:
-                mean, error = paired_difference(errors[candidate], errors[picks[FULL]])
-                row |= {f"{key}_worse": mean, f"{key}_worse_error": error}
+                errors = [as_errors(key, scores[c]) for c in (candidate, picks[FULL])]
+                row[f"{key}_worse"], row[f"{key}_worse_error"] = paired_difference(*errors)
         rows.append(row)
     return rows
-
-
-def _test_scores(search: Search, candidate: Candidate, seed: int) -> dict[str, list[float]]:
-    file = search.trials.run_of(candidate, seed) / f"test-{search.entries[candidate].steps}.json"
-    if not file.exists():
-        write_bytes(file, json.dumps(search.trials.score(candidate, seed, "test")).encode())
-    return dict(json.loads(file.read_text()))
-
-
-def _views(search: Search, finals: list[Candidate]) -> list[Row]:
-    """Return the scores of every validation image for the candidates that were trained longest."""
-    scores = {(c, key): search.scores(c, key, search.seeds) for c in finals for key in SCORES}
-    return [
-        {"candidate": c.name, "seed": seed, "view": view} | {key: scores[c, key][s, view] for key in SCORES}
-        for c in finals
-        for s, seed in enumerate(search.seeds)
-        for view in range(scores[c, SCORES[0]].shape[1])
-    ]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field, PositiveFloat, PositiveInt, ValidationInfo, field_validator
+from scipy.stats.qmc import Halton
 
 from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath
@@ -60,48 +61,42 @@ class SearchSpace(Settings):
 
     @field_validator("methods", "sizes", "point_counts", "photon_counts")
     @classmethod
-    def _unique(cls, values: tuple) -> tuple:
+    def _valid(cls, values: tuple, field: ValidationInfo) -> tuple:
+        """Return the values, numbers sorted; there is a config for each name, and no value twice."""
         if len(set(values)) < len(values):
             raise ValueError(f"must not have duplicates, is {list(values)}")
-        return values if isinstance(values[0], str) else tuple(sorted(values))
-
-    @field_validator("methods", "sizes")
-    @classmethod
-    def _known(cls, names: tuple[str, ...], field: ValidationInfo) -> tuple[str, ...]:
-        kind = "model" if field.field_name == "methods" else "variant"
+        kind = {"methods": "model", "sizes": "variant"}.get(field.field_name or "")
+        if kind is None:
+            return tuple(sorted(values))
         known = config_names(kind)
-        for name in names:
+        for name in values:
             if name not in known and not find_config(kind, name).is_file():
                 raise ValueError(f"no {name!r} in configs/{kind}; known are {', '.join(known)}")
-        return names
+        return values
 
     @classmethod
     def load(cls, config: str, minutes: float | None = None) -> SearchSpace:
         """Read a config by name or path; `minutes` overrides the config's.
 
         Raises:
-            UserError: a key is unknown, missing or wrong.
+            UserError: a key is unknown, missing or wrong, or does not fit the configs of the data or the scale.
         """
         file = find_config("select", config)
         given = {} if minutes is None else {"minutes": minutes}
         space = parse(cls, {"name": file.stem, **read_configs([file]), **given}, file)
-        space._check(file)
-        return space
-
-    def _check(self, file: Path) -> None:
-        """Check what several configs say together."""
-        for key, has in (("point_counts", self.spec.num_points), ("photon_counts", self.spec.num_photons)):
-            most = getattr(self, key)[-1]
+        for key, has in (("point_counts", space.spec.num_points), ("photon_counts", space.spec.num_photons)):
+            most = getattr(space, key)[-1]
             if most > has:
                 raise UserError(f"{file}: {key}: {most} is more than the {has} of the dataset")
-        scale = find_config("scale", self.scale)
+        scale = find_config("scale", space.scale)
         for split in ("train", "val", "test"):
-            if self.spec.count(split) * len(self.spec.scenes) < 2:
+            if space.spec.count(split) * len(space.spec.scenes) < 2:
                 raise UserError(f"{scale}: data.dataset.{split}: must give at least 2 samples, gives fewer")
         parse(PositiveInt, read_configs([scale]).get("trainer", {}).get("max_steps"), scale, "trainer.max_steps")
-        for method in self.methods:
-            if not issubclass(method_class(self._config(method, self.sizes[0]), file), RenderingModule):
+        for method in space.methods:
+            if not issubclass(method_class(space._config(method, space.sizes[0]), file), RenderingModule):
                 raise UserError(f"{file}: methods: {method} is not trained; give a trained method")
+        return space
 
     @cached_property
     def _loaded(self) -> tuple[DatasetSpec, AnyPath]:
@@ -127,8 +122,10 @@ class SearchSpace(Settings):
             points = self.point_counts if reads("point_") else (None,)
             photons = self.photon_counts if reads("photon_") else (None,)
             combinations = list(itertools.product([method], self.sizes, points, photons))[::-1]
-            order = sorted(range(len(combinations)), key=lambda k: _van_der_corput(k, len(combinations)))
-            columns.append([Candidate(*combinations[k]) for k in order])
+            # The first, the last, the middle one, the quarters, and so on: the order of a van der Corput sequence.
+            place = Halton(1, scramble=False).random(len(combinations))[:, 0]
+            place[-1], place[0] = -1, -2
+            columns.append([Candidate(*combinations[k]) for k in place.argsort()])
         rows = itertools.zip_longest(*columns)
         return [candidate for row in rows for candidate in row if candidate]
 
@@ -156,11 +153,3 @@ class SearchSpace(Settings):
         module = build(self.config(candidate), find_config("model", candidate.method), **sizes)
         assert isinstance(module, RenderingModule)
         return module
-
-
-def _van_der_corput(k: int, count: int) -> int:
-    """Return a sort key that puts the ends of 0..count-1 first, then the middle, the quarters, and so on."""
-    if k in (0, count - 1):
-        return -2 if k == 0 else -1
-    bits = (count - 1).bit_length()
-    return int(format(k, f"0{bits}b")[::-1], 2)

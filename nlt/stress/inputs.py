@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,14 +15,14 @@ from nlt.models.method import Batch
 _IMAGES = tuple(name for name, field in (FIELDS | BATCH_FIELDS).items() if field.shape[1:] == ("H", "W"))
 
 
-def _points(batch: Batch, share: float) -> Batch:
+def _points(batch: Batch, share: float, *_: np.ndarray) -> Batch:
     """Keep the first points, which are in random order, and mark the others as not visible."""
     count = batch["point_visible"].shape[1]
     first = torch.arange(count, device=batch["point_visible"].device) < max(1, round(share * count))
     return batch | {"point_visible": batch["point_visible"] & first}
 
 
-def _photons(batch: Batch, share: float) -> Batch:
+def _photons(batch: Batch, share: float, *_: np.ndarray) -> Batch:
     """Keep photons at equal strides in their list, which is sorted by emitter; the total power stays the same."""
     total = batch["photon_flux"].shape[1]
     count = round(share * total)
@@ -30,7 +31,7 @@ def _photons(batch: Batch, share: float) -> Batch:
     return batch | fewer | {"photon_flux": fewer["photon_flux"] * (total / max(count, 1))}
 
 
-def _spp(batch: Batch, spp: float) -> Batch:
+def _spp(batch: Batch, spp: float, *_: np.ndarray) -> Batch:
     """Give input pixels `spp` samples on average; the pixels with one sample more are random."""
     less, more = int(np.floor(spp)), int(np.ceil(spp))
     image = batch["noisy_input"]
@@ -53,7 +54,7 @@ def _moved(batch: Batch, rotation: np.ndarray, translation: np.ndarray) -> Batch
     return batch | {name: value.to(batch[name].dtype) for name, value in changed.items()}
 
 
-def _shifted(batch: Batch, metres: float, up: np.ndarray, middle: np.ndarray) -> Batch:
+def _shifted(batch: Batch, metres: float, up: np.ndarray, *_: np.ndarray) -> Batch:
     """Move along the diagonal of the two horizontal axes."""
     level = (up == 0) / np.linalg.norm(up == 0)
     return _moved(batch, np.eye(3), metres * level)
@@ -65,7 +66,7 @@ def _turned(batch: Batch, degrees: float, up: np.ndarray, middle: np.ndarray) ->
     return _moved(batch, rotation, middle - rotation @ middle)
 
 
-def _mirrored(batch: Batch, _: float, up: np.ndarray, middle: np.ndarray) -> Batch:
+def _mirrored(batch: Batch, *_: Any) -> Batch:
     """Mirror every image, and the camera's matrix so that points fall on the pixels where they are visible."""
     width = batch["depth"].shape[-1]
     flip = torch.tensor([[-1.0, 0, width], [0, 1, 0], [0, 0, 1]], device=batch["depth"].device)
@@ -73,9 +74,8 @@ def _mirrored(batch: Batch, _: float, up: np.ndarray, middle: np.ndarray) -> Bat
     return batch | images | {"camera_matrix": flip @ batch["camera_matrix"]}
 
 
-FRAME: dict[str, Callable[[Batch, float, np.ndarray, np.ndarray], Batch]] = {
+# Each takes the batch, the change's value, and the scene's up vector and the middle of its camera's box.
+INPUTS: dict[str, Callable[..., Batch]] = {
+    "points": _points, "photons": _photons, "pixels": lambda batch, *_: batch, "spp": _spp,
     "shifted": _shifted, "turned": _turned, "mirrored": _mirrored,
-}  # fmt: skip
-BUDGET: dict[str, Callable[[Batch, float], Batch]] = {
-    "points": _points, "photons": _photons, "pixels": lambda batch, _: batch, "spp": _spp,
 }  # fmt: skip

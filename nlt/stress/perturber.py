@@ -34,6 +34,8 @@ class ViewPerturber:
         self.up, self.horizontal = self.description.up, np.flatnonzero(self.description.up == 0)
         room = self.description.room
         self.middle = (self.description.camera if room is None else room).mean(0)
+        self.light: Any = self.description.light  # None unless there is a moving light
+        self.centres = [self.scene._centres[m.name] for m in self.scene.movables]  # at rest
         self.objects = np.array([m.name != MOVING_LIGHT for m in self.scene.movables], bool)
         self._emitter: Any = {}  # the moving light's, if there is one
         if not self.objects.all():
@@ -53,10 +55,9 @@ class ViewPerturber:
         """Return training's points under the current light."""
         if self.light_size == 1 and (self.light_gain == 1).all():
             return self.points
-        light, lit = self.description.light, self.points["object"] == len(self.objects) - 1
-        assert light is not None
+        centre, lit = self.light.centre, self.points["object"] == len(self.objects) - 1
         position, emission = self.points["position"].copy(), self.points["emission"].copy()
-        position[lit] = light.centre + (position[lit] - light.centre) * self.light_size
+        position[lit] = centre + (position[lit] - centre) * self.light_size
         emission[lit] *= self.light_gain.astype(np.float32)
         return self.points | {"position": position, "emission": emission}
 
@@ -66,9 +67,7 @@ class ViewPerturber:
         """Scale the sides and the radiance (3,) of the moving light, if there is one."""
         self.light_size, self.light_gain = size, np.broadcast_to(gain, 3)
         for key in self._emitter.keys():  # noqa: SIM118
-            light = self.description.light
-            assert light is not None
-            light = dataclasses.replace(light, size=light.size * size, radiance=light.radiance * gain)
+            light = dataclasses.replace(self.light, size=self.light.size * size, radiance=self.light.radiance * gain)
             self.scene.description = dataclasses.replace(self.description, light=light)
             self._emitter[key] = mi.Color3f(light.radiance.tolist())
             if is_jit():
@@ -82,10 +81,6 @@ class ViewPerturber:
         self.scene.set_state(SceneState(translation, present))
         if not self.render.views.passes(self.camera):
             self.camera = self.render.views.sample(self.camera.height, self.rng)
-
-    def centre(self, movable: int) -> np.ndarray:
-        """Return the centre (3,) of a movable object at rest."""
-        return self.scene._centres[self.scene.movables[movable].name]
 
     def camera_at(self, position: np.ndarray, target: np.ndarray) -> Camera:
         """Return a camera with the same lens as the current one, at a position and aimed at a target."""
@@ -141,10 +136,8 @@ def light_lowered(view: ViewPerturber, metres: float) -> None:
 
 def turned_from_light(view: ViewPerturber, degrees: float) -> None:
     """Turn the camera about the vertical until its azimuth is `degrees` away from the light's."""
-    (first, second), light = view.horizontal, view.description.light
-    assert light is not None
-    eye, ahead = view.camera.position, view.camera.rotation[:, 2]
-    to_light = light.centre + view.scene.state.translation[-1] - eye
+    (first, second), eye, ahead = view.horizontal, view.camera.position, view.camera.rotation[:, 2]
+    to_light = view.light.centre + view.scene.state.translation[-1] - eye
     level, sign = np.sqrt(1 - (ahead @ view.up) ** 2), view.rng.choice([-1, 1])
     for side in (sign, -sign):  # the other side if the first one does not show the room
         azimuth = np.arctan2(to_light[second], to_light[first]) + np.radians(degrees) * side
@@ -160,7 +153,7 @@ def object_outside(view: ViewPerturber, metres: float) -> None:
     state = view.scene.state
     shown = view.objects & state.present
     k = view.largest(shown if shown.any() else view.objects)
-    box, to_middle = view.scene.movables[k].box, view.middle - view.centre(k)
+    box, to_middle = view.scene.movables[k].box, view.middle - view.centres[k]
     axis = max(view.horizontal, key=lambda a: abs(to_middle[a]))
     moved, present = state.translation.copy(), state.present.copy()
     moved[k, axis] = box[1, axis] + metres if to_middle[axis] > 0 else box[0, axis] - metres
@@ -180,7 +173,7 @@ def objects_crowded(view: ViewPerturber, share: float) -> None:
     state = view.scene.state
     moved = state.translation.astype(float)
     for k in np.flatnonzero(view.objects).tolist():
-        moved[k, view.horizontal] += share * (view.middle - view.centre(k) - moved[k])[view.horizontal]
+        moved[k, view.horizontal] += share * (view.middle - view.centres[k] - moved[k])[view.horizontal]
     view.move(moved, state.present | view.objects)
 
 

@@ -1,4 +1,4 @@
-"""Rendering and reading the stress suites of a dataset, in a file per ladder, severity and scene."""
+"""Rendering of the stress suites of a dataset, in a file per ladder, severity and scene."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from nlt.data.dataset import SampleTensors, collate
+from nlt.data.dataset import SampleTensors
 from nlt.data.engines import Local, available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import Points, ShardReader, points_name, read_points, write_shard
+from nlt.data.store import points_name, read_points, write_shard
 from nlt.errors import UserError
 from nlt.rendering.variant import choose_variant
 from nlt.scenes.assembly import Scene
+from nlt.scenes.camera import Camera
 from nlt.scenes.pointcloud import sample_points
 from nlt.stress.changed_scene import MESHES, ChangedScene
 from nlt.stress.perturber import ViewPerturber, lacks, path
@@ -102,30 +101,25 @@ def render_suites(spec: DatasetSpec, dataset: AnyPath, suites: Suites, sets: lis
     missing = [view_set for view_set in sets if view_set.name not in existing]
     if not missing:
         return
+    # Each job is a process. A changed scene has one of its own, because Mitsuba does not release the scene before it.
+    # The other view sets of a scene share some, because loading a scene costs as much as a few views.
+    jobs, cpus = list[tuple[ViewSet, ...]](), available_cpus()
+    for scene in range(len(spec.scenes)):
+        plain = [view_set for view_set in missing if view_set.scene == scene and view_set.change not in MESHES]
+        jobs += [tuple(plain[k::cpus]) for k in range(min(cpus, len(plain)))]
+    jobs += [(view_set,) for view_set in missing if view_set.change in MESHES]
     total, failures = sum(view_set.views for view_set in missing), dict[tuple[ViewSet, ...], str]()
     print(f"{directory}: {total} views of {len(missing)} sets to render", flush=True)
     work = partial(_render, spec, suites, str(dataset), str(directory), choose_variant().name)
-    engine = Local(available_cpus(), preload=(SampleTensors.__module__,))
+    engine = Local(cpus, preload=(SampleTensors.__module__,))
     with (
         tqdm(total=total, unit="view", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
-        closing(engine.run(work, _jobs(missing), failures)) as ticks,
+        closing(engine.run(work, jobs, failures)) as ticks,
     ):
         for ticked in ticks:
             bar.update((ticked or 0) - bar.n)
     for job, reason in failures.items():
         raise UserError(f"{directory / job[0].name}: the worker that rendered it died twice ({reason})")
-
-
-def _jobs(missing: list[ViewSet]) -> list[tuple[ViewSet, ...]]:
-    """Group the view sets by process, because loading a scene costs as much as a few views.
-
-    A changed scene has a process of its own, because Mitsuba does not release the scene before it.
-    """
-    changed = [(view_set,) for view_set in missing if view_set.change in MESHES]
-    plain = [view_set for view_set in missing if view_set.change not in MESHES]
-    cpus = available_cpus()
-    in_scenes = ([view_set for view_set in plain if view_set.scene == k] for k in sorted({s.scene for s in plain}))
-    return [*(tuple(part) for mine in in_scenes for k in range(cpus) if (part := mine[k::cpus])), *changed]
 
 
 def _render(
@@ -148,48 +142,24 @@ def _render(
     render = SampleRenderer(replace(spec, reference_spp=suites.reference), first.scene, threads, build)
     perturber = ViewPerturber(render, points, suites.seed)
     for view_set in job:
-        samples = []
-        for sample in _samples(perturber, suites, view_set):
+        ladder = zlib.crc32(f"{view_set.suite}/{view_set.ladder}".encode())
+        seeds = np.random.SeedSequence([suites.seed, view_set.scene, ladder, view_set.severity]).spawn(view_set.views)
+        cameras: Iterator[Camera] = (perturber.place(k, view_set.change, view_set.value) for k in range(view_set.views))
+        if view_set.is_path:
+            cameras = path(perturber, view_set.ladder, view_set.value, view_set.views)
+        samples, images = [], view_set.path_traced(suites)
+        for camera, seed in zip(cameras, seeds, strict=True):
+            sample = render.view(camera, seed, view_set.fields(render.spec))
+            for image_seed, (name, spp) in zip(seed.spawn(len(images)), images.items(), strict=True):
+                radiance = render.radiance(camera, spp, int(image_seed.generate_state(1)[0]))
+                sample[name] = np.ascontiguousarray(radiance)
             samples.append(sample)
             tick(1)
-        write_shard(directory / view_set.points_name, [_points(perturber, view_set)])
+        if view_set.ladder == DRAWS:
+            cloud = sample_points(render.scene, spec.num_points, spec.seed + view_set.severity)
+        elif isinstance(render.scene, ChangedScene):
+            cloud = render.scene.moved_points()
+        else:
+            cloud = perturber.lit_points()
+        write_shard(directory / view_set.points_name, [cloud])
         write_shard(directory / view_set.name, samples)
-
-
-def _samples(perturber: ViewPerturber, suites: Suites, view_set: ViewSet) -> Iterator[dict[str, np.ndarray]]:
-    """Yield the views of a set, with all fields that methods read and the renderings for methods without training."""
-    ladder = zlib.crc32(f"{view_set.suite}/{view_set.ladder}".encode())
-    seeds = np.random.SeedSequence([suites.seed, view_set.scene, ladder, view_set.severity]).spawn(view_set.views)
-    if view_set.is_path:
-        cameras = path(perturber, view_set.ladder, view_set.value, view_set.views)
-    else:
-        cameras = (perturber.place(k, view_set.change, view_set.value) for k in range(view_set.views))
-    images = view_set.path_traced(suites)
-    for camera, seed in zip(cameras, seeds, strict=True):
-        sample = perturber.render.view(camera, seed, view_set.fields(perturber.render.spec))
-        for image_seed, (name, spp) in zip(seed.spawn(len(images)), images.items(), strict=True):
-            radiance = perturber.render.radiance(camera, spp, int(image_seed.generate_state(1)[0]))
-            sample[name] = np.ascontiguousarray(radiance)
-        yield sample
-
-
-def _points(perturber: ViewPerturber, view_set: ViewSet) -> Points:
-    """Return the point cloud of a set: training's in the changed scene, or another draw."""
-    if view_set.ladder == DRAWS:
-        spec = perturber.render.spec
-        return sample_points(perturber.scene, spec.num_points, spec.seed + view_set.severity)
-    if isinstance(perturber.scene, ChangedScene):
-        return perturber.scene.moved_points()
-    return perturber.lit_points()
-
-
-def read_views(
-    directory: AnyPath, spec: DatasetSpec, suites: Suites, view_set: ViewSet, points: Points | None = None
-) -> dict[str, Tensor]:
-    """Read the views of a set as a batch, with its `path_traced` images. `points` replaces the set's points."""
-    names, reader = [*view_set.fields(spec), *view_set.path_traced(suites)], ShardReader()
-    views = [reader.read(directory / view_set.name, k, names) for k in range(view_set.views)]
-    if view_set.ladder == DRAWS:
-        return collate([{name: torch.from_numpy(array) for name, array in view.items()} for view in views])
-    tensors = SampleTensors(spec, {view_set.scene: points or read_points(directory / view_set.points_name)})
-    return collate([tensors(view_set.scene, view, k) for k, view in enumerate(views)])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
 
-from nlt.config import merge, read_configs
+from nlt.config import read_configs
 from nlt.data.engines import available_cpus
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison
@@ -18,9 +18,7 @@ from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
 from nlt.models.module import RenderingModule
-from nlt.stress.tables import STRESS, TRAININGS
-
-SEED, RATE, PRECISION, CORRUPTED = "seed", "learning rate", "precision", "corrupted samples"
+from nlt.stress.suites import STRESS, TRAININGS, Trainings
 
 
 class Corruption(L.Callback):
@@ -38,7 +36,7 @@ class Corruption(L.Callback):
 def train_suite(
     directory: Path,
     comparison: Comparison,
-    content: Mapping[str, Any],
+    suite: Trainings,
     runs: Path,
     error: Callable[[Method], float],
     device: torch.device,
@@ -51,15 +49,18 @@ def train_suite(
     path = directory / TRAININGS
     finished = [row for row in read_rows(path) if row["status"] == OK] if path.exists() else []
     known = {row["run"]: row["error"] for row in finished}
+    first_of_kind: dict[str, str] = {}  # the first trained method of each class and set of inputs
+    for method in comparison.trained:
+        model = read_configs([comparison.files[method][1]])["model"]
+        inputs = {name: value for name, value in model.get("init_args", {}).items() if type(value) is not int}
+        first_of_kind.setdefault(f"{model['class_path']} {inputs}", method)
     jobs: list[tuple[dict[str, Any], Training]] = []
-    for method in _one_per_kind(comparison):
-        config = comparison.configs[method]
-        for variation, value, seed, changes in _variations(config, content, comparison):
+    for method in first_of_kind.values():
+        for variation, value, seed, changes in _variations(comparison, method, suite):
             training = Training.of(comparison, method, seed, runs / STRESS, changes=changes)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
     # Networks this small leave a second core idle; an accelerator runs one training at a time.
     failures = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
-    rows = []
     for row, training in jobs:
         run = training.run.name
         row |= {"status": FAILED if training in failures else OK, "message": failures.get(training, ""), "run": run}
@@ -68,40 +69,25 @@ def train_suite(
                 row["error"] = known[run] if run in known else error(training.load(device)[0])
         except DivergedError as problem:
             row |= {"status": DIVERGED, "message": str(problem)}
-        rows.append(row)
-    write_rows(path, rows)
-
-
-def _one_per_kind(comparison: Comparison) -> list[str]:
-    """Return the first trained method of each class and set of inputs."""
-    first_of_kind: dict[str, str] = {}
-    for method in comparison.trained:
-        model = read_configs([comparison.files[method][1]])["model"]
-        inputs = {name: value for name, value in model.get("init_args", {}).items() if type(value) is not int}
-        first_of_kind.setdefault(f"{model['class_path']} {inputs}", method)
-    return list(first_of_kind.values())
+    write_rows(path, (row for row, _ in jobs))
 
 
 def _variations(
-    config: Mapping[str, Any], content: Mapping[str, Any], comparison: Comparison
-) -> list[tuple[str, str, int, dict[str, Any]]]:
-    """Return each variation's kind, value, seed, and the config that overrides the method's own."""
+    comparison: Comparison, method: str, suite: Trainings
+) -> Iterator[tuple[str, str, int, dict[str, Any]]]:
+    """Yield each variation's kind, value, seed, and the config that overrides the method's own."""
+    config, seed = comparison.configs[method], comparison.seeds[0]
     steps = config.get("trainer", {}).get("max_steps")
     if not steps:
         raise UserError(f"{comparison.scale}: trainer.max_steps: missing; the suite training needs it")
     default = inspect.signature(RenderingModule).parameters["learning_rate"].default
     rate = config["model"].get("init_args", {}).get("learning_rate", default)
-    steps = max(1, round(content["share"] * steps))
-    base = {"trainer": {"max_steps": steps, "limit_val_batches": 0, "precision": "32-true"}}
-    trainer = lambda **more: merge(base, {"trainer": more})
-    first = comparison.seeds[0]
-    damage = {"class_path": f"{__name__}.{Corruption.__name__}", "init_args": {"share": content["corrupted"]}}
-    return [
-        *((SEED, str(seed), seed, base) for seed in range(first, first + content["seeds"])),
-        *(
-            (RATE, f"x{factor:g}", first, merge(base, {"model": {"init_args": {"learning_rate": rate * factor}}}))
-            for factor in content["learning_rate"]
-        ),
-        (PRECISION, content["precision"], first, trainer(precision=content["precision"])),
-        (CORRUPTED, f"{content['corrupted']:.0%}", first, trainer(callbacks=[damage])),
-    ]
+    trainer = {"max_steps": max(1, round(suite.share * steps)), "limit_val_batches": 0, "precision": "32-true"}
+    for k in range(seed, seed + suite.seeds):
+        yield "seed", str(k), k, {"trainer": trainer}
+    for factor in suite.learning_rate:
+        model = {"init_args": {"learning_rate": rate * factor}}
+        yield "learning rate", f"x{factor:g}", seed, {"trainer": trainer, "model": model}
+    yield "precision", suite.precision, seed, {"trainer": trainer | {"precision": suite.precision}}
+    damage = {"class_path": f"{__name__}.{Corruption.__name__}", "init_args": {"share": suite.corrupted}}
+    yield "corrupted samples", f"{suite.corrupted:.0%}", seed, {"trainer": trainer | {"callbacks": [damage]}}

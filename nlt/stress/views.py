@@ -13,17 +13,18 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import Points, read_points
+from nlt.data.store import Points, ShardReader, read_points
 from nlt.display import expose
 from nlt.errors import UserError
 from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
 from nlt.models.transport import PointEmbedding
-from nlt.stress.inputs import BUDGET, FRAME
-from nlt.stress.rendering import DRAWS, ViewSet, read_views
+from nlt.stress.inputs import INPUTS
+from nlt.stress.rendering import DRAWS, ViewSet
 from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
 
 
@@ -41,9 +42,16 @@ class SuiteViews:
         self.batch = cache(self._batch)
 
     def _batch(self, view_set: ViewSet, points: Points | None = None) -> Batch:
-        """Return the views of a set, with its own points or with others."""
-        batch = read_views(self.directory, self.spec, self.suites, view_set, points)
-        return {name: value.to(self.device) for name, value in batch.items()}
+        """Return the views of a set, with its `path_traced` images and with its own points or with others."""
+        names, reader = [*view_set.fields(self.spec), *view_set.path_traced(self.suites)], ShardReader()
+        stored = [reader.read(self.directory / view_set.name, k, names) for k in range(view_set.views)]
+        if view_set.ladder == DRAWS:
+            views = [{name: torch.from_numpy(array) for name, array in view.items()} for view in stored]
+        else:
+            points = points or read_points(self.directory / view_set.points_name)
+            tensors = SampleTensors(self.spec, {view_set.scene: points})
+            views = [tensors(view_set.scene, view, k) for k, view in enumerate(stored)]
+        return {name: value.to(self.device) for name, value in collate(views).items()}
 
     @property
     def clean(self) -> list[Batch]:
@@ -65,9 +73,8 @@ class SuiteViews:
             return self._flicker(method), {}
         rows, images = [], {}
         for ladder, severity, batches in self._changed(suite, method):
-            view_rows, radiance = self.rows(method, batches)
+            view_rows, images[ladder] = self.rows(method, batches)
             rows += [{"ladder": ladder, "severity": severity, **row} for row in view_rows]
-            images[ladder] = radiance
         return rows, images
 
     def _changed(self, suite: str, method: Method | None) -> Iterator[tuple[str, int, list[Batch]]]:
@@ -77,23 +84,20 @@ class SuiteViews:
             for name, severity in dict.fromkeys((view_set.ladder, view_set.severity) for view_set in mine):
                 yield name, severity, [self.batch(s) for s in mine if (s.ladder, s.severity) == (name, severity)]
             return
+        frames = [(scene.up, scene.camera.mean(0)) for scene in self.spec.descriptions]
         hparams: dict[str, Any] = getattr(method, "hparams", {})
         own = dict(hparams)  # to be restored after the denoisers are given another number of pixels
         for (owner, name), ladder in self.suites.ladders.items():
             if owner == suite and (method is None or _reads(method, ladder.change)):
+                change = INPUTS[ladder.change]
                 try:
                     for severity, value in enumerate(ladder.values, 1):
                         if ladder.change == "pixels":
                             hparams["one_in"] = value
-                        yield name, severity, [self._compute(batch, ladder.change, value) for batch in self.clean]
+                        scenes = zip(self.clean, frames, strict=True)
+                        yield name, severity, [change(batch, value, *frame) for batch, frame in scenes]
                 finally:
                     hparams.update(own)
-
-    def _compute(self, batch: Batch, change: str, value: float) -> Batch:
-        if change in BUDGET:
-            return BUDGET[change](batch, value)
-        description = self.spec.descriptions[int(batch["scene"][0])]
-        return FRAME[change](batch, value, description.up, description.camera.mean(0))
 
     def rows(self, method: Method, batches: list[Batch]) -> tuple[list[dict[str, Any]], np.ndarray]:
         """Return a row per view, and the radiance (V, 3, H, W), 0 where it is not finite."""
@@ -102,13 +106,11 @@ class SuiteViews:
         for judged in evaluate(method, [self._with_traced(method, batch) for batch in batches], metrics):
             batch = judged.batch
             error = relative_error(judged.radiance, batch["reference_a"], batch["reference_b"], batch["exposure"])
-            columns = {"error": error, "nonfinite": judged.nonfinite}
+            columns = {"scene": batch["scene"], "view": torch.arange(len(error)), "error": error}
+            columns |= {"nonfinite": judged.nonfinite}
             columns |= {name: judged.metrics[name] for name in ("unbiased_mse", "mse", "mssim")}
-            values = {name: column.tolist() for name, column in columns.items()}
-            rows += [
-                {"scene": int(batch["scene"][k]), "view": k, **{name: column[k] for name, column in values.items()}}
-                for k in range(len(judged.radiance))
-            ]
+            views = zip(*(column.tolist() for column in columns.values()), strict=True)
+            rows += [dict(zip(columns, values, strict=True)) for values in views]
             images.append(judged.radiance.float().cpu().numpy())
         return rows, np.concatenate(images)
 
@@ -126,8 +128,6 @@ class SuiteViews:
             batch = batch | {"traced": batch[name]}
         return batch
 
-    # --- flicker ---
-
     def _flicker(self, method: Method) -> list[dict[str, Any]]:
         """Return a method's rows of the suite flicker.
 
@@ -135,20 +135,28 @@ class SuiteViews:
         a path is the mean square change from frame to frame, relative to the reference's.
         """
         rows = []
-        for scene, clean in enumerate(self.clean):
+        for clean_set in (view_set for view_set in self.view_sets if view_set.suite == CLEAN):
+            scene, clean = clean_set.scene, self.batch(clean_set)
             mine = [view_set for view_set in self.view_sets if (view_set.suite, view_set.scene) == (FLICKER, scene)]
-            draws = [view_set for view_set in mine if view_set.ladder == DRAWS]
             a, b = (expose(clean[f"reference_{half}"].double(), clean["exposure"]) for half in "ab")
             scale = (a * b).mean().item()
             row = lambda kind, value, images, scene=scene: {
                 "ladder": kind, "severity": 0, "scene": scene, "value": value,
                 "nonfinite": int((~images.isfinite()).sum()),
             }  # fmt: skip
-            for kind in ("points", "photons", "noise"):
-                if _reads(method, kind):
-                    predictions = (self._with_drawn(method, clean, draw, kind) for draw in draws)
-                    images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
-                    rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
+            for kind in (kind for kind in ("points", "photons", "noise") if _reads(method, kind)):
+                predictions = []
+                for draw in (view_set for view_set in mine if view_set.ladder == DRAWS):
+                    if kind == "points":
+                        before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
+                        moved = _with_nearest_embeddings(method, scene, before, after)
+                        predictions.append(self.predict(moved, self._batch(clean_set, after)))
+                    else:
+                        prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
+                        drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
+                        predictions.append(self.predict(method, clean | drawn))
+                images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
+                rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
             for view_set in (view_set for view_set in mine if view_set.is_path):
                 frames = self.batch(view_set)
                 own, a, b = (
@@ -157,16 +165,6 @@ class SuiteViews:
                 )
                 rows.append(row(view_set.ladder, (own.square().mean() / (a * b).mean()).item(), own))
         return rows
-
-    def _with_drawn(self, method: Method, clean: Batch, draw: ViewSet, kind: str) -> Tensor:
-        """Predict the clean views with another draw of points, photons or input noise."""
-        if kind != "points":
-            prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
-            drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
-            return self.predict(method, clean | drawn)
-        clean_set = next(s for s in self.view_sets if (s.suite, s.scene) == (CLEAN, draw.scene))
-        before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
-        return self.predict(_with_nearest_embeddings(method, draw.scene, before, after), self._batch(clean_set, after))
 
 
 def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Method:

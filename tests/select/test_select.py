@@ -33,7 +33,7 @@ from nlt.scenes.assembly import Scene
 from nlt.scenes.builtin import BUILTINS, mitsuba_scene
 from nlt.scenes.description import EXPERIMENTS, load_description
 from nlt.scenes.pointcloud import sample_points
-from nlt.select import advice, search, trials
+from nlt.select import advice, search
 from nlt.select.choice import choose, paired_difference, ranked, within
 from nlt.select.space import SearchSpace
 from nlt.waiting import WAIT_POLICY
@@ -247,7 +247,7 @@ class FakeTime:
 
     def __init__(self, patch, per_step=1.0, setup=2.0):
         self.seconds, self.per_step, self.setup, self.begun, self.die = 0.0, per_step, setup, [], math.inf
-        original = trials.Trials._fit
+        original = search.Search._fit
 
         def fit(this, run, candidate, seed, steps):
             self.begun.append((candidate.name, seed, steps, self.seconds))
@@ -259,9 +259,8 @@ class FakeTime:
             self.seconds += self.setup + done * self.per_step * width
             return done
 
-        for module in (search, trials):
-            patch.setattr(module, "now", lambda: self.seconds)
-        patch.setattr(trials.Trials, "_fit", fit)
+        patch.setattr(search, "now", lambda: self.seconds)
+        patch.setattr(search.Search, "_fit", fit)
         patch.setattr(search.Search, "_step_s", lambda this, module: self.per_step * module.hparams["width"])
 
 
@@ -368,7 +367,7 @@ def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
     """Where nothing moves, a CNN is trained to the end, although it is the slowest and the worst."""
     FakeTime(monkeypatch)
     monkeypatch.setattr(advice, "measure_facts", lambda spec: [facts(lights, lights)])
-    score, race = trials.Trials.score, clock.Clock.time_interleaved
+    score, race = search.Search.score, clock.Clock.time_interleaved
     worse = lambda this, candidate, *how: {
         key: [value + 9 * (candidate.method == "cnn") * (-1) ** (key == "mssim") for value in values]
         for key, values in score(this, candidate, *how).items()
@@ -377,7 +376,7 @@ def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
         name: [{stage: t * (100 if "cnn" in name else 1) for stage, t in lap.items()} for lap in laps]
         for name, laps in race(this, modules, budget).items()
     }
-    monkeypatch.setattr(trials.Trials, "score", worse)
+    monkeypatch.setattr(search.Search, "score", worse)
     monkeypatch.setattr(clock.Clock, "time_interleaved", slower)
     finals = [row for row in run_select(space) if row["steps"] == str(STEPS)]
     assert len(finals) == 3 and any(row["full"] == "1" for row in finals)

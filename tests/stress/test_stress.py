@@ -27,12 +27,11 @@ from nlt.models.projection import visible_pixels
 from nlt.paths import CONFIGS
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES, ChangedScene
-from nlt.stress.figures import stress_section
-from nlt.stress.inputs import BUDGET, FRAME
+from nlt.stress.inputs import INPUTS
 from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
+from nlt.stress.report import breaking_point, stress_section
 from nlt.stress.suites import load_suites
-from nlt.stress.tables import breaking_point
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +42,7 @@ MANIFEST = CONFIGS / "stress" / "suites.yaml"
 
 def test_the_manifest_names_changes_that_there_are():
     suites = load_suites("suites")
-    known = {*MESHES, *PLACES, "points", "photons", "pixels", "spp", "shifted", "turned", "mirrored"}
+    known = {*MESHES, *PLACES, *INPUTS}
     assert {ladder.change for ladder in suites.ladders.values()} == known
 
 
@@ -214,15 +213,15 @@ def test_frames_of_the_world():
     up, middle = np.array([0.0, 1, 0]), np.array([1.0, 2, 3])
     pixels = lambda b: visible_pixels(b["point_position"], b["point_visible"], **{name: b[name] for name in PROJECTION})
     expected = pixels(batch)
-    for change, value in ((FRAME["shifted"], 3.0), (FRAME["turned"], 70.0)):
+    for change, value in ((INPUTS["shifted"], 3.0), (INPUTS["turned"], 70.0)):
         moved = change(batch, value, up, middle)
         assert not torch.allclose(moved["point_position"], batch["point_position"])
         assert torch.equal(pixels(moved), expected)
-    half = FRAME["turned"](batch, 180.0, up, middle)["point_position"]
+    half = INPUTS["turned"](batch, 180.0, up, middle)["point_position"]
     about = torch.tensor([2.0, 0, 6]).double() + batch["point_position"] * torch.tensor([-1, 1, -1])
     torch.testing.assert_close(half, about)
     single = batch | {"camera_matrix": batch["camera_matrix"].float()}
-    flipped = pixels(double(FRAME["mirrored"](single, 1, up, middle)))
+    flipped = pixels(double(INPUTS["mirrored"](single, 1, up, middle)))
     row, column = expected // 13, expected % 13
     assert torch.equal(flipped, torch.where(expected < 169, row * 13 + 12 - column, expected))
 
@@ -231,16 +230,16 @@ def test_budgets():
     batch = synthetic_batch()
     batch |= {f"input_{n}": torch.full_like(batch["noisy_input"], n) for n in (1, 2, 3)}
     quarter = batch["point_visible"] & (torch.arange(POINTS) < POINTS // 4)
-    assert torch.equal(BUDGET["points"](batch, 0.25)["point_visible"], quarter)
-    fewer = BUDGET["photons"](batch, 0.5)
+    assert torch.equal(INPUTS["points"](batch, 0.25)["point_visible"], quarter)
+    fewer = INPUTS["photons"](batch, 0.5)
     assert fewer["photon_hit"].shape[1] == PHOTONS // 2
     chosen = [any(torch.equal(hit, other) for other in batch["photon_hit"][0]) for hit in fewer["photon_hit"][0]]
     assert all(chosen)
     torch.testing.assert_close(fewer["photon_flux"].sum(1), batch["photon_flux"].sum(1), rtol=0.2, atol=0)
-    assert BUDGET["photons"](batch, 0)["photon_flux"].shape[1] == 0
-    mixed = BUDGET["spp"](batch, 2.5)["noisy_input"]
+    assert INPUTS["photons"](batch, 0)["photon_flux"].shape[1] == 0
+    mixed = INPUTS["spp"](batch, 2.5)["noisy_input"]
     assert set(mixed.unique().tolist()) == {2.0, 3.0} and mixed.mean().item() == pytest.approx(2.5, abs=0.15)
-    assert (BUDGET["spp"](batch, 1)["noisy_input"] == 1).all()
+    assert (INPUTS["spp"](batch, 1)["noisy_input"] == 1).all()
 
 
 @pytest.mark.parametrize(
