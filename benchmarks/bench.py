@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from nlt.cli import _pair, _Parser, _positive, exit_code
+from nlt.cli import Parser, exit_code, pair, positive
 from nlt.waiting import wait_passively
 
 
@@ -28,21 +28,21 @@ def _run(argv: Sequence[str] | None) -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="python benchmarks/bench.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", default="demo", help="config in configs/data, by name or path (default: demo)")
     parser.add_argument("--scale", default="demo", help="config in configs/scale, by name or path (default: demo)")
     parser.add_argument("--methods", nargs="+", help="configs in configs/model (default: all but the ablation's)")
     parser.add_argument(
-        "--set", dest="changed", nargs="+", action="extend", type=_pair, default=[], metavar="KEY=VALUE",
+        "--set", dest="changed", nargs="+", action="extend", type=pair, default=[], metavar="KEY=VALUE",
         help="override resolution, num_points, num_photons, width, depth, batch_size, workers or batch (frames)",
     )  # fmt: skip
     parser.add_argument(
         "--ckpt", dest="checkpoint", metavar="CKPT", help="checkpoint of the only method (default: random weights)"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), help="cpu or cuda (default: cuda if available)")
-    parser.add_argument("--seconds", type=_positive, default=20, help="maximum seconds per measurement (default: 20)")
+    parser.add_argument("--seconds", type=positive, default=20, help="maximum seconds per measurement (default: 20)")
     parser.add_argument(
         "--growth", nargs="*", metavar="METHOD",
         help="also vary resolution, num_points, num_photons, width and batch (without METHOD: of nlt_photons)",

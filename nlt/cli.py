@@ -52,7 +52,7 @@ class _Commands(argparse._SubParsersAction):
         return super().add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", **options)
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.register("action", "parsers", _Commands)
@@ -183,7 +183,7 @@ def _scenes(options: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="nlt", description="Learned light transport: find the best renderer for a scene and a time budget.",
         epilog="`nlt compare --config demo` runs everything in minutes. Datasets are written to datasets, trainings to "
         "runs and results to results, all in the current directory. docs/commands.md describes all commands.",
@@ -212,10 +212,10 @@ def _parser() -> argparse.ArgumentParser:
     stress.add_argument(
         "--manifest", default="suites", help="file in configs/stress, by name or path (default: suites)"
     )
-    stress.add_argument("--views", type=_positive, help="views per scene (default: the manifest's)")
-    compare.add_argument("--seeds", type=_positive, default=1, help="training runs per method (default: 1)")
+    stress.add_argument("--views", type=positive, help="views per scene (default: the manifest's)")
+    compare.add_argument("--seeds", type=positive, default=1, help="training runs per method (default: 1)")
     compare.add_argument(
-        "--train-images", nargs="+", type=_positive, default=[], metavar="N",
+        "--train-images", nargs="+", type=positive, default=[], metavar="N",
         help="also train every method on the first N images of each scene, for learning curves",
     )  # fmt: skip
     _add_scheduler(compare, "concurrent training runs (default: 1; on a cluster, as for nlt generate)")
@@ -230,9 +230,9 @@ def _parser() -> argparse.ArgumentParser:
         help="torch.export program, for example nlt.pt2, or NAME.safetensors: only the weights, for nlt render",
     )  # fmt: skip
     export.add_argument(
-        "--resolution", type=_positive, default=256, help="image height and width in pixels (default: 256)"
+        "--resolution", type=positive, default=256, help="image height and width in pixels (default: 256)"
     )
-    export.add_argument("--photons", type=_positive, default=10000, help="number of input photons (default: 10000)")
+    export.add_argument("--photons", type=positive, default=10000, help="number of input photons (default: 10000)")
     _add_render(commands.add_parser("render", help="render a video with a trained method next to path tracing"))
     select = commands.add_parser("select", help="find the smallest model that suffices for a scene, within minutes")
     select.add_argument("--config", required=True, help="ladder in configs/select, by name or path")
@@ -243,7 +243,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     report = commands.add_parser("report", help="redraw a comparison's tables, figures and report.html, or show them")
     report.add_argument("directory", help="results directory of nlt compare")
-    report.add_argument("--megabytes", type=_positive, help="maximum size of report.html (default: 25)")
+    report.add_argument("--megabytes", type=positive, help="maximum size of report.html (default: 25)")
     report.add_argument(
         "--dashboard", nargs="?", type=_whole, const=6006, metavar="PORT",
         help="show the training runs and results in TensorBoard instead (default port: 6006; 0 takes a free one)",
@@ -253,13 +253,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
-    parser.add_argument("--workers", type=_positive, help=workers)
+    parser.add_argument("--workers", type=positive, help=workers)
     parser.add_argument(
         "--scheduler", default="local",
         help="local, slurm or a Dask scheduler, for example tcp://host:8786 (default: local)",
     )  # fmt: skip
     parser.add_argument(
-        "--slurm", action="append", type=_pair, default=[], metavar="KEY=VALUE",
+        "--slurm", action="append", type=pair, default=[], metavar="KEY=VALUE",
         help="option of sbatch, for example time=60",
     )  # fmt: skip
 
@@ -275,12 +275,12 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", default="video.mp4", help="NAME.mp4 or a frame folder (default: video.mp4)")
     for option, default, text in (("--frames", 36, "number of frames"), ("--fps", 24, "frames per second")):
-        parser.add_argument(option, type=_positive, default=default, help=f"{text} (default: {default})")
+        parser.add_argument(option, type=positive, default=default, help=f"{text} (default: {default})")
     parser.add_argument("--resolution", type=_size, default=(256, 256), help="N or WIDTHxHEIGHT, pixels (default: 256)")
     parser.add_argument(
         "--spp", type=_spp, help="samples per pixel of path tracing; 0 omits it (default: equal, at equal time)"
     )
-    parser.add_argument("--photons", type=_positive, help="number of input photons (default: as in training)")
+    parser.add_argument("--photons", type=positive, help="number of input photons (default: as in training)")
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
@@ -297,11 +297,11 @@ def _add_scenes(parser: argparse.ArgumentParser) -> None:
     preview = actions.add_parser("preview", help="draw a contact sheet with one row of random views per scene")
     preview.add_argument("-o", "--output", type=_picture, default="preview.png", help=_IMAGE.format("preview.png"))
     preview.add_argument("names", nargs="+", help=f"scenes: each a {_SCENE}")
-    preview.add_argument("--views", type=_positive, default=4, help="random views per scene (default: 4)")
+    preview.add_argument("--views", type=positive, default=4, help="random views per scene (default: 4)")
     preview.add_argument(
-        "--resolution", type=_positive, default=256, help="image height and width in pixels (default: 256)"
+        "--resolution", type=positive, default=256, help="image height and width in pixels (default: 256)"
     )
-    preview.add_argument("--spp", type=_positive, default=64, help="samples per pixel (default: 64)")
+    preview.add_argument("--spp", type=positive, default=64, help="samples per pixel (default: 64)")
     preview.add_argument(
         "--experiment", type=_experiment, default="fixed_lights",
         help="static, fixed_lights or moving_lights (default: fixed_lights)",
@@ -317,7 +317,7 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     show.add_argument("-o", "--output", type=_picture, default="sample.png", help=_IMAGE.format("sample.png"))
     verify = actions.add_parser("verify", help="read every byte and report everything that is wrong")
     stats = actions.add_parser("stats", help="measure bytes and seconds by field, here and at the paper's scale")
-    stats.add_argument("--workers", type=_positive, help="concurrent processes (default: available CPUs)")
+    stats.add_argument("--workers", type=positive, help="concurrent processes (default: available CPUs)")
     for action in (show, verify, stats):
         action.add_argument("dataset", help="directory or URL that nlt generate prints")
 
@@ -337,7 +337,7 @@ def _run_data(options: argparse.Namespace) -> None:
         print(stats(options.dataset, options.workers))
 
 
-def _pair(text: str) -> tuple[str, str]:
+def pair(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     if not (key and equals and value):
         raise argparse.ArgumentTypeError(f"must be KEY=VALUE, is {text!r}")
@@ -346,7 +346,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    return _positive(width), _positive(height or width)
+    return positive(width), positive(height or width)
 
 
 def _spp(text: str) -> int | None:
@@ -369,7 +369,7 @@ def _suite(text: str) -> str:
     return text
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
     return _whole(text, 1)
 
 
