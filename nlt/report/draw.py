@@ -7,9 +7,8 @@ from pathlib import Path
 
 from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.results import load
-from nlt.report.figures import draw_samples, draw_speed_accuracy
-from nlt.report.gallery import Shown, draw_failures, draw_qualitative
-from nlt.report.learning_curves import draw_learning_curves
+from nlt.report.figures import draw_learning_curves, draw_speed_accuracy
+from nlt.report.gallery import Shown, draw_failures, draw_qualitative, draw_samples
 from nlt.report.page import Section, write_page
 from nlt.report.tables import write_tables
 
@@ -31,10 +30,11 @@ def draw(
     claims = write_claims(results)
     for claim in claims:
         print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
-    draw_samples(results)
     draw_speed_accuracy(results)
     draw_learning_curves(results)
     if images := Shown.load(results):
-        draw_qualitative(images)
-        draw_failures(images)
+        draw_samples(images)
+        if images.methods:
+            draw_qualitative(images)
+            draw_failures(images)
     write_page(results, claims, megabytes, [section(results.directory) for section in sections])
