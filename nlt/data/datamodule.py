@@ -100,19 +100,11 @@ class LightTransportDataModule(L.LightningDataModule):
         return self.passes - 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint.
-
-        `points` has a CRC of each scene's points, to which embeddings belong. `passes` is the number of passes over
-        online samples that were started; a resumed run continues after them.
-        """
+        """Return a checkpoint's state: CRCs of the points that embeddings belong to, and online passes begun so far."""
         return {"point_checksums": self.point_checksums, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the state of a checkpoint.
-
-        Raises:
-            UserError: the method's embeddings belong to other points than the dataset's.
-        """
+        """Restore a checkpoint's state; raise UserError if its embeddings belong to other points than the dataset's."""
         self.passes = state_dict.get("passes", 0)
         theirs, ours = state_dict.get("point_checksums"), self.point_checksums
         method = getattr(self.trainer, "lightning_module", None)
@@ -123,11 +115,7 @@ class LightTransportDataModule(L.LightningDataModule):
             )
 
     def setup(self, stage: str) -> None:
-        """Check that the dataset exists and read its points.
-
-        Raises:
-            UserError: the dataset is missing, incomplete or has another spec.
-        """
+        """Read the dataset's points; raise UserError if it is missing, incomplete or has another spec."""
         if self.directory is None:
             directory = self.stored.directory(self.root)
             check_dataset(directory, self.stored)

@@ -44,8 +44,7 @@ class Engine(ABC):
     def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         """Run all jobs. A job that dies is retried once; if it dies again, the reason is added to `failures`.
 
-        Raises:
-            UserError: `work` raised it.
+        A UserError that `work` raises ends all jobs and is raised here.
         """
         waiting, retried = list(jobs), set()
         running: dict[Any, Any] = {}  # jobs by future
@@ -244,12 +243,7 @@ class Process:
         return not self._process.is_alive()
 
     def result(self) -> Any:
-        """Wait for the function and return its result.
-
-        Raises:
-            UserError: the function raised it.
-            Died: the process died.
-        """
+        """Wait for the function and return its result; raise its UserError, or Died if the process died."""
         try:
             result = self._receive.recv()
         except EOFError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -78,8 +77,7 @@ class Shown:
     def causes(self) -> dict[str, np.ndarray]:
         """The pixels (V, H, W) to which each of `CAUSES` applies; several may apply to a pixel.
 
-        Raises:
-            UserError: the images are from an older version.
+        Raises UserError if the images are from an older version.
         """
         buffers = self.results.images("gbuffer")
         assert buffers is not None
@@ -195,23 +193,16 @@ def failures(results: Results) -> Table | None:
     path = results.directory / FAILURES
     if not path.exists():
         return None
-    by_method: dict[str, dict[str, dict[str, Any]]] = {}
-    for row in read_rows(path):
-        by_method.setdefault(row["method"], {})[row["cause"]] = row
-    causes = list(next(iter(by_method.values())))
-    everywhere = [next(iter(by_method.values()))[cause]["share_of_all"] for cause in causes]
-    counts = [
-        [
-            label(method),
-            *(f"{by_cause[cause]['share_of_worst']:.1%} ({by_cause[cause]['pixels']:,})" for cause in causes),
-        ]
-        for method, by_cause in by_method.items()
-    ]
+    cells = {(row["method"], row["cause"]): row for row in read_rows(path)}
+    methods, causes = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
+    text = lambda row: f"{row['share_of_worst']:.1%} ({row['pixels']:,})"
+    rows = [[label(method), *(text(cells[method, cause]) for cause in causes)] for method in methods]
+    rows.append(["all pixels", *(f"{cells[methods[0], cause]['share_of_all']:.1%}" for cause in causes)])
     return Table(
         "Causes of the worst pixels",
         f"Each method's worst tenth of the pixels in {len(results.manifest['shown'])} test views: the share to which a "
         "cause applies, and the number of these pixels. Several causes may apply to a pixel. If the share exceeds that "
         "of all pixels, the cause is associated with errors.",
         causes,
-        [*counts, ["all pixels", *(f"{share:.1%}" for share in everywhere)]],
+        rows,
     )

@@ -20,10 +20,7 @@ from nlt.report.plots import plt
 def show_sample(place: str, split: str, index: int, output: Path) -> Path:
     """Draw the twelve pictures of the supplementary's figure "Data Sample Components" and return the figure's path.
 
-    They are of sample `index` of an evaluated split.
-
-    Raises:
-        UserError: there is no such dataset or sample.
+    Raise UserError if there is no such dataset or no sample `index` in the split, val or test.
     """
     directory = open_path(place)
     dataset = LightTransportDataset(directory, read_spec(directory), split)
