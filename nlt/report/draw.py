@@ -16,14 +16,10 @@ from nlt.report.tables import write_tables
 def draw(
     directory: str | Path, megabytes: int | None = None, sections: Iterable[Callable[[Path], Section | None]] = ()
 ) -> None:
-    """Write the tables, figures and report.html of the results in a directory.
+    """Write the tables, figures and report.html (at most `megabytes`) of the results in a directory.
 
-    Args:
-        megabytes: the maximum size of report.html.
-        sections: functions that return a feature's section of report.html for a directory, or None.
-
-    Raises:
-        UserError: the directory has no results, or they cannot be read.
+    `sections` are functions that return a feature's section of report.html for a directory, or None. Raise UserError if
+    the directory has no results or they cannot be read.
     """
     results = load(directory)
     write_tables(results)
