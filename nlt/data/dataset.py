@@ -21,12 +21,9 @@ _TARGETS["test"] = _TARGETS["val"]
 
 
 class SampleTensors:
-    """Converts stored samples to the tensors of `FIELDS` and `BATCH_FIELDS` that a method reads.
+    """Converts stored samples to tensors; adds those of `BATCH_FIELDS` that are `wanted`, or all if it is None.
 
-    Args:
-        spec: the dataset's spec.
-        points: the point cloud of each scene, by the scene's index.
-        wanted: names of the fields to derive from the stored arrays, points and camera; None for all.
+    `points` has the point cloud of each scene, by the scene's index.
     """
 
     def __init__(self, spec: DatasetSpec, points: Mapping[int, Points], wanted: Set[str] | None = None) -> None:
@@ -41,7 +38,7 @@ class SampleTensors:
         }
 
     def wants(self, name: str) -> bool:
-        """Whether the method reads this field."""
+        """Return whether a field is wanted."""
         return self._wanted is None or name in self._wanted
 
     def __call__(self, scene: int, stored: Mapping[str, np.ndarray], index: int = 0) -> dict[str, Tensor]:
@@ -61,13 +58,9 @@ class SampleTensors:
 
 
 class LightTransportDataset(Dataset[dict[str, Tensor]]):
-    """The samples of one split, as the fields of `FIELDS` and `BATCH_FIELDS` that `inputs` names.
+    """The samples of a split (train, val or test), as the fields of `FIELDS` and `BATCH_FIELDS` that `inputs` names.
 
-    Args:
-        directory: the dataset's directory.
-        spec: the dataset's spec.
-        split: train, val or test.
-        inputs: names of the fields that the method reads; None for all. The split's target fields are added.
+    If `inputs` is None, they have all fields. The split's target fields are always added.
     """
 
     def __init__(self, directory: AnyPath, spec: DatasetSpec, split: str, inputs: Iterable[str] | None = None) -> None:
@@ -105,15 +98,9 @@ class LightTransportDataset(Dataset[dict[str, Tensor]]):
 def place_points(
     points: dict[str, np.ndarray], translation: np.ndarray, present: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move and hide the points of a scene according to a state (supplementary, Sec. Datasets).
+    """Return positions (N, 3), metres, and visibility (N,) of a scene's points in a state (supplementary, Datasets).
 
-    Args:
-        points: the scene's point cloud.
-        translation: (M, 3), metres, of each movable object.
-        present: (M,), whether each object is in the scene.
-
-    Returns:
-        Positions (N, 3), metres, and visibility (N,).
+    `translation` (M, 3), metres, and `present` (M,) are those of the movable objects.
     """
     # Static points have object index -1 and so select the appended row, which leaves them in place.
     translation, present = np.concatenate([translation, np.zeros((1, 3), np.float32)]), np.append(present, True)

@@ -44,8 +44,7 @@ class Engine(ABC):
     def run(self, work: Work, jobs: list[Any], failures: dict[Any, str]) -> Ticks:
         """Run all jobs. A job that dies is retried once; if it dies again, the reason is added to `failures`.
 
-        Raises:
-            UserError: `work` raised it.
+        A UserError that `work` raises ends all jobs and is raised here.
         """
         waiting, retried = list(jobs), set()
         running: dict[Any, Any] = {}  # jobs by future
@@ -59,7 +58,8 @@ class Engine(ABC):
                 for future in [future for future in running if future.done()]:
                     job = running.pop(future)
                     try:
-                        _raise_user_error(future.result())
+                        if isinstance(result := future.result(), UserError):
+                            raise result
                     except UserError:
                         raise
                     except Exception as error:  # Dask and submitit raise different classes for a lost worker
@@ -86,13 +86,13 @@ class Engine(ABC):
 
 
 def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], preload: tuple[str, ...] = ()) -> Engine:
-    """Return the engine that `--scheduler` names: local, slurm, slurm-local or a Dask scheduler's address.
+    """Return the engine that `--scheduler` names.
 
     Args:
-        scheduler: value of `--scheduler`.
+        scheduler: local, slurm, slurm-local (which emulates a Slurm array here) or a Dask scheduler's address.
         workers: number of concurrent jobs (default: the available CPUs; on Dask, its threads; in a Slurm array, 64).
         slurm: options of a Slurm job.
-        preload: modules to import once per machine: slow to import, and without threads of their own (so not Mitsuba).
+        preload: modules to import once per machine; they must not start threads, as Mitsuba does.
 
     Raises:
         UserError: the scheduler is unknown, not installed or not reachable, or the options do not fit it.
@@ -122,7 +122,7 @@ class Local(Engine):
         self._counters: dict[Any, Any] = {}
 
     def _start(self, work: Work, jobs: list[Any]) -> list[Process]:
-        self._counters |= {job: _counter() for job in jobs}
+        self._counters |= {job: _CONTEXT.RawValue("q", 0) for job in jobs}  # a killed process could keep a lock
         threads = max(1, available_cpus() // self.workers)
         start = partial(Process, _work, preload=self._preload)
         return [start(pickle.dumps((work, job)), threads, self._counters[job]) for job in jobs]
@@ -192,16 +192,12 @@ def _on_dask(content: bytes, preload: tuple[str, ...]) -> UserError | None:
 
     multiprocessing.current_process().daemon = False  # a daemon may not start processes
     threads = max(1, available_cpus() // get_worker().state.nthreads)
-    return _result_or_user_error(Process(_work, content, threads, _counter(), preload=preload).result)
+    process = Process(_work, content, threads, _CONTEXT.RawValue("q", 0), preload=preload)
+    return _result_or_user_error(process.result)
 
 
 def _on_slurm(work: Work, job: Any) -> UserError | None:
     return _result_or_user_error(work, job, available_cpus(), lambda _: None)
-
-
-def _counter() -> Any:
-    # Without a lock, because a killed process could leave it held.
-    return _CONTEXT.RawValue("q", 0)
 
 
 def _work(content: bytes, threads: int, counter: Any) -> None:
@@ -226,28 +222,16 @@ def _result_or_user_error(function: Callable, *arguments: Any) -> Any:
         return error
 
 
-def _raise_user_error(result: Any) -> Any:
-    if isinstance(result, UserError):
-        raise result
-    return result
-
-
-def _context(preload: tuple[str, ...]) -> Any:
-    """Return a context whose processes are spawned or, with `preload`, forked from a server with these modules only."""
-    if not preload:
-        return _CONTEXT
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
-    with as_the_user_said():
-        forkserver.ensure_running()
-    return context
-
-
 class Process:
-    """Calls a function in a new process; the `preload` modules are imported once for all processes."""
+    """Calls a function in a new process: spawned or, with `preload`, forked from a server with only these modules."""
 
     def __init__(self, function: Callable, *arguments: Any, preload: tuple[str, ...] = ()) -> None:
-        context = _context(preload)
+        context: Any = _CONTEXT
+        if preload:
+            context = multiprocessing.get_context("forkserver")
+            context.set_forkserver_preload(list(preload))
+            with as_the_user_said():
+                forkserver.ensure_running()
         self._receive, send = context.Pipe(duplex=False)
         self._process = context.Process(target=_send_result, args=(send, function, *arguments), daemon=True)
         self._process.start()
@@ -259,19 +243,16 @@ class Process:
         return not self._process.is_alive()
 
     def result(self) -> Any:
-        """Wait for the function and return its result.
-
-        Raises:
-            UserError: the function raised it.
-            Died: the process died.
-        """
+        """Wait for the function and return its result; raise its UserError, or Died if the process died."""
         try:
             result = self._receive.recv()
         except EOFError:
             self._process.join()
             raise Died(f"exit code {self._process.exitcode}") from None
         self._process.join()
-        return _raise_user_error(result)
+        if isinstance(result, UserError):
+            raise result
+        return result
 
 
 def _send_result(send: Any, function: Callable, *arguments: Any) -> None:

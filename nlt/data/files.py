@@ -23,13 +23,11 @@ _HOST = platform.node().replace(".", "-")
 
 
 def open_path(place: str | AnyPath) -> AnyPath:
-    """Return a path object for a local path or an fsspec URL such as s3://bucket/datasets.
-
-    Raises:
-        UserError: no installed package supports the URL's protocol.
-    """
-    if "://" not in str(place) or isinstance(place, UPath):
-        return place if isinstance(place, UPath) else Path(place)
+    """Return a path object for a local path or an fsspec URL; raise UserError if no package supports its protocol."""
+    if isinstance(place, UPath):
+        return place
+    if "://" not in str(place):
+        return Path(place)
     try:
         path = UPath(str(place))
         path.fs  # noqa: B018  imports the protocol's package
@@ -100,14 +98,10 @@ def list_files(directory: AnyPath) -> set[str]:
 
 
 def local_copy(path: AnyPath, fresh: bool = False) -> Path:
-    """Return a local file itself, or a copy of a URL in `NLT_CACHE` (default: ~/.cache/nlt) that is downloaded once.
-
-    Args:
-        path: the file.
-        fresh: download the file again.
+    """Return a local file itself, or a copy of a URL in `cache_root()`, downloaded once or, if `fresh`, again.
 
     Raises:
-        FileNotFoundError: the file does not exist.
+        FileNotFoundError: a URL's file does not exist.
     """
     if not isinstance(path, UPath):
         return path

@@ -51,12 +51,8 @@ def generate(
     """Render the missing files of a dataset and return its directory.
 
     After being killed at any time, another run renders only the unfinished shards, with the same bytes. Two concurrent
-    runs may use the same directory.
-
-    Args:
-        spec: the dataset's spec.
-        root: directory or fsspec URL of datasets; every machine that renders must be able to access it.
-        workers, scheduler, slurm: as in `nlt.data.engines.find_engine`.
+    runs may use the same directory. Every machine that renders must be able to access `root`, a directory or fsspec
+    URL. The other arguments are those of `find_engine`.
 
     Raises:
         UserError: a scene is invalid, a worker died twice, or the disk is too small.
@@ -165,10 +161,8 @@ def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
         in_scene = [shard for shard in shards if shard.scene == scene]
         needs_points = points_name(scene) in missing
         # Shards of evaluated splits cost more, so they are spread over the jobs.
-        count = -(-len(in_scene) // most)
-        parts = [in_scene[k::count] for k in range(count)] or [[]]
-        nonempty = [(k, tuple(part)) for k, part in enumerate(parts) if part or needs_points]
-        jobs += [Job(scene, part, needs_points and k == 0) for k, part in nonempty]
+        count = max(-(-len(in_scene) // most), int(needs_points))
+        jobs += [Job(scene, tuple(in_scene[k::count]), needs_points and k == 0) for k in range(count)]
     return jobs
 
 

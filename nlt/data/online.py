@@ -18,12 +18,8 @@ class OnlineDataset(LightTransportDataset):
 
     With one scene, it begins with the samples of a stored dataset with the same seed.
 
-    Args:
-        directory: directory of the dataset, for the points.
-        spec: the dataset's spec; training samples avoid the states of its val and test samples.
-        inputs: names of the fields that the method reads, None for all; only these are rendered.
-        length: samples per epoch.
-        threads: threads of each rendering process.
+    Only the fields in `inputs`, or all if it is None, are rendered. The samples avoid the states of the val and test
+    samples of `spec`. An epoch has `length` samples, and each rendering process has `threads` threads.
     """
 
     def __init__(

@@ -216,8 +216,7 @@ class _Config(Settings):
 def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
     """Return the dataset in config files, without training samples that are rendered online, and the root of datasets.
 
-    Raises:
-        UserError: a file cannot be read, or has an unknown, missing or invalid key.
+    Raise UserError if a file cannot be read, or has an unknown, missing or invalid key.
     """
     content = merge({"data": {"dataset": {"scenes": []}}}, read_configs(files))
     data = parse(_Config, content, " + ".join(files)).data

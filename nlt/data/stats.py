@@ -39,12 +39,8 @@ _MOST_SPP = 8  # maximum samples per pixel of a timed reference
 def stats(place: str, workers: int | None = None) -> str:
     """Return a report of bytes and seconds by field, at the dataset's and at the paper's size, with total costs.
 
-    Bytes follow from the manifest. Seconds are measured in `workers` concurrent processes after a warm-up and averaged
-    over all scenes. A reference with more than 8 spp is timed at 8 spp and extrapolated linearly. The dataset's
+    Raise UserError if there is no dataset or the renderer crashes. Seconds are averaged over all scenes. The dataset's
     references count with the samples per pixel chosen from pilot views, the paper's with the maximum allowed.
-
-    Raises:
-        UserError: there is no dataset, or the renderer crashes.
     """
     spec = read_spec(open_path(place))
     spp = [reference["spp"] for reference in references(open_path(place), spec)]

@@ -53,10 +53,8 @@ class ShardReader:
     def read(self, path: AnyPath, row: int, fields: Collection[str]) -> dict[str, np.ndarray]:
         """Return fields of one sample of a shard as views of the mapped file.
 
-        If the local copy of a remote file is damaged, it is downloaded once more.
-
-        Raises:
-            UserError: the shard is missing, truncated, or fails its CRC.
+        Raise UserError if the shard is missing, truncated, or fails its CRC; a damaged local copy of a remote file is
+        first downloaded once more.
         """
         try:
             return self._read(path, row, fields)
@@ -106,10 +104,9 @@ def pilot_name(scene: int) -> str:
 
 
 def read_pilot(directory: AnyPath, scene: int) -> dict[str, Any]:
-    """Return the pilot result of a scene: `spp`, and the `predicted_mse` between the reference's halves.
+    """Return a scene's pilot result: `spp`, and the `predicted_mse` between the reference's halves.
 
-    Raises:
-        UserError: the file is missing or damaged.
+    Raise UserError if the file is missing or damaged.
     """
     path = directory / pilot_name(scene)
     try:
@@ -146,11 +143,7 @@ def missing_files(directory: AnyPath, spec: DatasetSpec) -> list[str]:
 
 
 def read_manifest(directory: AnyPath) -> dict[str, Any]:
-    """Return the content of a dataset's manifest.
-
-    Raises:
-        UserError: the manifest is missing or damaged.
-    """
+    """Return the content of a dataset's manifest; raise UserError if it is missing or damaged."""
     path = directory / MANIFEST
     advice = "run `nlt generate` with the same --config files"
     try:
@@ -170,11 +163,7 @@ def read_spec(directory: AnyPath) -> DatasetSpec:
 
 
 def check_dataset(directory: AnyPath, spec: DatasetSpec) -> None:
-    """Check that a directory holds the complete dataset of `spec`.
-
-    Raises:
-        UserError: the dataset is missing, incomplete or has another spec.
-    """
+    """Raise UserError if a directory does not hold the complete dataset of `spec`."""
     manifest, advice = read_manifest(directory), "run `nlt generate` with the same --config files"
     for key, value in spec.manifest.items():
         if key != "nlt" and manifest.get(key) != value:

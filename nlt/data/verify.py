@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 
@@ -54,10 +54,10 @@ def verify(place: str) -> None:
     states: dict[tuple[int, str], set[bytes]] = defaultdict(set)
     with ThreadPoolExecutor(available_cpus()) as pool:
         checks = pool.map(partial(_check_file, directory, spec.sizes), files)
-        for file, _ in zip(files, tqdm(checks, "verifying", len(files), unit="file"), strict=True):
-            findings += file.findings
+        for file, (problems, keys) in zip(files, tqdm(checks, "verifying", len(files), unit="file"), strict=True):
+            findings += [f"{file.name}: {problem}" for problem in problems]
             if file.shard:
-                states[file.shard.scene, file.shard.split] |= file.states
+                states[file.shard.scene, file.shard.split] |= keys
     findings += _check_splits(spec, states)
     print(*findings, f"{directory}: {len(files)} files read, {len(findings)} findings", sep="\n", flush=True)
     if findings:
@@ -78,63 +78,54 @@ def _check_manifest(directory: AnyPath, spec: DatasetSpec, existing: set[str]) -
                 yield str(error)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _File:
-    """A file of points or samples: what it should hold, what is wrong with it, and the states of its samples."""
+    """A file of points or samples and what it should hold."""
 
     name: str
     fields: Mapping[str, Field]
     count: int  # of samples
     shard: Shard | None = None
-    findings: list[str] = field(default_factory=list)
-    states: set[bytes] = field(default_factory=set)
-
-    def report(self, name: str, wrong: np.ndarray, problem: str) -> None:
-        """Add a finding about the samples that the mask `wrong` (n,) selects."""
-        if wrong.any():
-            self.findings.append(f"{self.name}: {name}: sample {', '.join(map(str, np.flatnonzero(wrong)))}: {problem}")
 
 
-def _check_file(directory: AnyPath, sizes: dict[str, int], file: _File) -> None:
-    """Read a file and record its findings and states."""
+def _check_file(directory: AnyPath, sizes: dict[str, int], file: _File) -> tuple[list[str], set[bytes]]:
+    """Read a file and return its problems and the states of its samples."""
     try:
         arrays = load((directory / file.name).read_bytes())
     except (OSError, SafetensorError) as error:
-        file.findings.append(f"{file.name}: cannot be read: {error}")
-        return
-    if _check_form(file, arrays, sizes) and file.shard:
-        _check_images(file, arrays)
-        rows = zip(arrays["translation"], arrays["present"], strict=True)
-        file.states = {SceneState(moved, present).key for moved, present in rows}
-
-
-def _check_form(file: _File, arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> bool:
-    """Check names, shapes, dtypes, CRCs and finite values; return whether every array has its declared form."""
+        return [f"cannot be read: {error}"], set()
     declared = {name: ((file.count, *f.resolve(sizes)), f.dtype) for name, f in file.fields.items()}
     declared |= {CRC + name: ((file.count,), "uint32") for name in file.fields}
     actual = {name: (array.shape, array.dtype.name) for name, array in arrays.items()}
     wrong = [name for name in {**declared, **actual} if declared.get(name) != actual.get(name)]
-    file.findings += [
-        f"{file.name}: {name}: is {actual.get(name, 'missing')}, not {declared.get(name, 'declared')}" for name in wrong
-    ]
+    problems = [f"{name}: is {actual.get(name, 'missing')}, not {declared.get(name, 'declared')}" for name in wrong]
+    masks = []  # name, which of the samples (n,) are wrong, and why
     for name in [name for name in file.fields if name not in wrong and CRC + name not in wrong]:
-        file.report(name, checksums(arrays[name]) != arrays[CRC + name], "fails its CRC")
-        file.report(name, ~np.isfinite(arrays[name].reshape(file.count, -1)).all(1), "not finite")
-    return not wrong
+        masks.append((name, checksums(arrays[name]) != arrays[CRC + name], "fails its CRC"))
+        masks.append((name, ~np.isfinite(arrays[name].reshape(file.count, -1)).all(1), "not finite"))
+    keys: set[bytes] = set()
+    if file.shard and not wrong:
+        masks += _check_images(arrays)
+        rows = zip(arrays["translation"], arrays["present"], strict=True)
+        keys = {SceneState(moved, present).key for moved, present in rows}
+    problems += [
+        f"{name}: sample {', '.join(map(str, np.flatnonzero(mask)))}: {why}" for name, mask, why in masks if mask.any()
+    ]
+    return problems, keys
 
 
-def _check_images(file: _File, arrays: Mapping[str, np.ndarray]) -> None:
+def _check_images(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray, str]]:
     """Check that the images are not black or constant and that the camera sees a surface.
 
     With few samples per pixel, one noisy image may miss every light, so a sample fails only if both of its noisy images
     do.
     """
     constant = {name: (array == array[..., :1, :1]).all((1, 2, 3)) for name, array in arrays.items() if array.ndim == 4}
-    for name in ("reference_a", "reference_b"):
-        if name in arrays:
-            file.report(name, constant[name], "black or constant")
-    file.report("noisy, noisy_input", constant["noisy"] & constant["noisy_input"], "both black or constant")
-    file.report("depth", (arrays["depth"] == 0).all((1, 2, 3)), "the camera sees no surface")
+    yield from (
+        (name, constant[name], "black or constant") for name in ("reference_a", "reference_b") if name in arrays
+    )
+    yield "noisy, noisy_input", constant["noisy"] & constant["noisy_input"], "both black or constant"
+    yield "depth", (arrays["depth"] == 0).all((1, 2, 3)), "the camera sees no surface"
 
 
 def _check_splits(spec: DatasetSpec, states: Mapping[tuple[int, str], set[bytes]]) -> Iterable[str]:

@@ -13,8 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.utilities import dim_zero_cat
 
 from nlt.display import display, expose
-from nlt.metrics.feature_cache import cached_features
-from nlt.metrics.inception import STAGES, load_inception
+from nlt.metrics.inception import STAGES, cached_features, load_inception
 from nlt.metrics.jackknife import frechet_distance, kernel_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
 

@@ -33,7 +33,6 @@ _DISPLAY = "sRGB in [0, 1] at the scene's exposure"
 _LINEAR = "radiance × exposure"
 _FEATURES = "Inception features of sRGB"
 
-
 _image = partial(Quantity, per_image=True, perfect=0.0)
 
 METRICS: dict[str, Quantity] = {
@@ -66,13 +65,12 @@ COSTS: dict[str, Quantity] = {
     "images_seen": Quantity("images seen", "lower", ",.0f"),
 }
 QUANTITIES: dict[str, Quantity] = METRICS | COSTS
-_NONE = "–"
 
 
 def text(key: str, value: float | None) -> str:
     """Return a value as text in its quantity's printed unit, or a dash if it is missing or not finite."""
     if value is None or not math.isfinite(value):
-        return _NONE
+        return "–"
     quantity = QUANTITIES[key]
     return format(value * quantity.scale, quantity.format)
 

@@ -49,7 +49,17 @@ def write_logs(results: Results) -> Path:
     shutil.rmtree(logs, ignore_errors=True)
     with SummaryWriter(str(logs / "comparison")) as writer:
         writer.add_custom_scalars({title: {k: ["Multiline", v] for k, v in c.items()} for title, c in _CURVES.items()})
-        writer._get_file_writer().add_summary(_experiment(results))
+        # The names of hyperparameters and final metrics are declared once for all runs.
+        writer._get_file_writer().add_summary(
+            hp.hparams_config_pb(
+                hparams=[hp.HParam(name) for name in ("method", "seed", *_HPARAMS)],
+                metrics=[
+                    hp.Metric(f"final/{key}", display_name=heading(key))
+                    for key in dict.fromkeys((*COLUMNS, *METRICS))
+                    if any(len(results.values(method, key)) for method in results.methods)
+                ],
+            )
+        )
         for path in sorted(p for p in results.directory.iterdir() if p.suffix in (".png", ".webp")):
             writer.add_image(path.stem, np.asarray(Image.open(path).convert("RGB")), dataformats="HWC")
     for run in results.runs:
@@ -68,17 +78,6 @@ def write_logs(results: Results) -> Path:
     return logs
 
 
-def _experiment(results: Results) -> Any:
-    """Return the names of hyperparameters and final metrics, declared once for all runs."""
-    measured = [
-        key for key in dict.fromkeys((*COLUMNS, *METRICS)) if any(len(results.values(m, key)) for m in results.methods)
-    ]
-    return hp.hparams_config_pb(
-        hparams=[hp.HParam(name) for name in ("method", "seed", *_HPARAMS)],
-        metrics=[hp.Metric(f"final/{key}", display_name=heading(key)) for key in measured],
-    )
-
-
 def _hparams(results: Results, run: dict[str, Any]) -> dict[str, Any]:
     hparams: dict[str, Any] = {"method": label(run["method"]), "seed": run["seed"]}
     for name, keys in _HPARAMS.items() if isinstance(run.get("run"), str) else ():  # an untrained method has none
@@ -91,11 +90,7 @@ def _hparams(results: Results, run: dict[str, Any]) -> dict[str, Any]:
 
 
 def dashboard(directory: str, port: int) -> None:
-    """Show a comparison's results in TensorBoard until interrupted; print the address.
-
-    Raises:
-        UserError: there are no results, or the port is in use.
-    """
+    """Show results in TensorBoard until interrupted; raise UserError if there are none or the port is in use."""
     logs = write_logs(load(directory))
     board = program.TensorBoard()
     board.configure(logdir=str(logs), port=port, reload_interval=30)

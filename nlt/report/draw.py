@@ -7,9 +7,8 @@ from pathlib import Path
 
 from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.results import load
-from nlt.report.figures import draw_samples, draw_speed_accuracy
-from nlt.report.gallery import Shown, draw_failures, draw_qualitative
-from nlt.report.learning_curves import draw_learning_curves
+from nlt.report.figures import draw_learning_curves, draw_speed_accuracy
+from nlt.report.gallery import Shown, draw_failures, draw_qualitative, draw_samples
 from nlt.report.page import Section, write_page
 from nlt.report.tables import write_tables
 
@@ -17,24 +16,21 @@ from nlt.report.tables import write_tables
 def draw(
     directory: str | Path, megabytes: int | None = None, sections: Iterable[Callable[[Path], Section | None]] = ()
 ) -> None:
-    """Write the tables, figures and report.html of the results in a directory.
+    """Write the tables, figures and report.html (at most `megabytes`) of the results in a directory.
 
-    Args:
-        megabytes: the maximum size of report.html.
-        sections: functions that return a feature's section of report.html for a directory, or None.
-
-    Raises:
-        UserError: the directory has no results, or they cannot be read.
+    `sections` are functions that return a feature's section of report.html for a directory, or None. Raise UserError if
+    the directory has no results or they cannot be read.
     """
     results = load(directory)
     write_tables(results)
     claims = write_claims(results)
     for claim in claims:
         print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
-    draw_samples(results)
     draw_speed_accuracy(results)
     draw_learning_curves(results)
     if images := Shown.load(results):
-        draw_qualitative(images)
-        draw_failures(images)
+        draw_samples(images)
+        if images.methods:
+            draw_qualitative(images)
+            draw_failures(images)
     write_page(results, claims, megabytes, [section(results.directory) for section in sections])

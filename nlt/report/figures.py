@@ -1,98 +1,27 @@
-"""Figures of a comparison, drawn from its stored results, and the figure of a dataset's sample."""
+"""Charts of a comparison, drawn from its stored results: accuracy over time per frame, and along the trainings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
-from torch import Tensor
 
-from nlt.display import display
 from nlt.evaluation.paper import label
-from nlt.evaluation.results import OK, Results
+from nlt.evaluation.results import HISTORY, OK, TRAINING_IMAGES, Results
 from nlt.metrics.quantities import METRICS, heading
-from nlt.models.method import Batch
-from nlt.models.projection import average, visible_pixels
 from nlt.report import plots
 
-_ROWS = 6  # views in samples.webp
 # The supplementary's six panels and two more.
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 _CURVES = ("0.3", "#8C510A", "#000000")
-
-
-def draw_samples(results: Results) -> None:
-    """Draw samples.webp: a row per view, with the noisy training image, every method and the reference as displayed."""
-    finished = [method for method in results.methods if results.runs_of(method)]
-    stored = {name: results.images(name) for name in ("noisy", *finished, "reference")}
-    reference = stored["reference"]
-    if reference is None or stored["noisy"] is None:
-        return  # the images are only on the machine that made them
-    titles = {"noisy": "Training image", "reference": "Reference"}
-    columns = {titles.get(name) or label(name): found["radiance"] for name, found in stored.items() if found}
-    views = np.unique(np.linspace(0, len(reference["radiance"]) - 1, _ROWS).round().astype(int))
-    figure, axes = plots.grid(len(views), list(columns))
-    for line, view in zip(axes, views, strict=True):
-        for axis, images in zip(line, columns.values(), strict=True):
-            axis.imshow(plots.shown(images[view], reference["exposure"][view]))
-    plots.save(figure, results.directory, "samples", plots.PICTURE)
-
-
-def draw_sample(path: Path, sample: Batch) -> None:
-    """Draw the twelve pictures of the supplementary's figure "Data Sample Components" from a batch of one."""
-    visible, valid = sample["point_visible"][0], sample["photon_valid"][0]
-    height, width = sample["depth"].shape[-2:]
-    camera = (sample["camera_matrix"], sample["world_to_view"])
-    # A depth map of "no hit" occludes nothing.
-    in_view, kept = (
-        visible_pixels(sample["point_position"], sample["point_visible"], *camera, depth, sample["normal"])
-        for depth in (torch.zeros_like(sample["depth"]), sample["depth"])
-    )
-    points, hits = sample["point_position"][0], sample["photon_hit"][0][valid]
-    reference = (sample["reference_a"] + sample["reference_b"]) / 2
-    albedo, colour = sample["point_albedo"][0], (sample["photon_flux"] / sample["photon_flux"].amax())[0] * 0.8
-    shown = lambda image: display(image, sample["exposure"])[0].permute(1, 2, 0)
-    scatter = lambda pixels: average(albedo[None], pixels, height, width)[0].permute(1, 2, 0)
-    emission = shown(sample["point_emission"].mT[..., None])[:, 0]
-    images = {
-        "(1) noisy, 1 spp": shown(sample["noisy"]),
-        "(2) reference": shown(reference),
-        "(3) depth": (sample["depth"] / sample["depth"].amax())[0, 0],
-        "(4) normal": sample["normal"][0].permute(1, 2, 0) / 2 + 0.5,
-        "(5) albedo": sample["albedo"][0].permute(1, 2, 0),
-        "(6) point cloud": scatter(in_view),
-        "(7) point cloud, occluded points masked": scatter(kept),
-    }
-    clouds: dict[str, tuple[Tensor, Tensor]] = {
-        "(8) per-point visibility": (points, torch.tensor([[1, 0.9, 0], [0.3, 0.2, 0.5]])[visible.long()]),
-        "(9) per-point albedo": (points[visible], albedo[visible]),
-        "(10) per-point emission": (points[visible], emission[visible].clamp(min=0.3)),
-        "(11) photon origins": (sample["photon_origin"][0], colour),
-        "(12) photon hits": (hits, colour[valid]),
-    }  # fmt: skip
-    figure = plt.figure(figsize=(12, 8), facecolor="0.15")  # dark, because emitters are white
-    for k, (name, image) in enumerate(images.items(), 1):
-        figure.add_subplot(3, 4, k, title=name).imshow(image.clamp(0, 1).numpy(), cmap="viridis")
-    low, high = points.amin(0), points.amax(0)
-    for k, (name, (cloud, colours)) in enumerate(clouds.items(), len(images) + 1):
-        axis = figure.add_subplot(3, 4, k, title=name, projection="3d", facecolor="none")
-        x, y, z = cloud[:, 0], -cloud[:, 2], cloud[:, 1]
-        axis.scatter(x, y, z, c=colours.clamp(0, 1).numpy(), s=1.5, linewidths=0)
-        axis.set(xlim=(low[0], high[0]), ylim=(-high[2], -low[2]), zlim=(low[1], high[1]))
-        axis.set_box_aspect((high - low)[[0, 2, 1]].tolist())
-        axis.view_init(elev=35, azim=-60)
-    for axis in figure.axes:
-        axis.title.set(fontsize=8, color="white")
-        axis.set_axis_off()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+_LEARNING = ("mse", "mssim", "fid", "feature_l1", "flip")
+_MAX_PANELS = 4  # of the learning curves, per row
+_SHADES = (0.0, 0.65)  # of grey, for the first and the last method of a curve
 
 
 def draw_speed_accuracy(results: Results) -> None:
@@ -139,8 +68,7 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
         for number, m in enumerate(drawn):
             setting = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
             plots.annotate(axis, setting, points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
-    alone = [m for m in results.methods if all(m not in members for members in families.values())]
-    for k, m in enumerate(alone):
+    for k, m in enumerate(_alone(results, families)):
         point = {m: points[m]} if m in points else {}
         _plot(axis, results, key, point, label=label(m), ls="", mec="white", mew=0.6, zorder=3, **plots.style(k))
     axis.margins(0.09, 0.12)
@@ -188,3 +116,84 @@ def curves(results: Results) -> dict[str, list[str]]:
             rays = lambda m: runs[m]["spp"] * runs[m]["pixel_fraction"]
             joined[f"{label(members[0]).partition(' (')[0]} ({varied})"] = sorted(members, key=rays)
     return joined
+
+
+def _alone(results: Results, families: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the methods that are part of no curve."""
+    return [m for m in results.methods if all(m not in members for members in families.values())]
+
+
+def draw_learning_curves(results: Results) -> None:
+    """Draw learning_curves.png and .svg: a row of panels per file; bands are ± 1 standard deviation over seeds."""
+    files = {
+        HISTORY: ("images_seen", "images seen in training", "validation"),
+        TRAINING_IMAGES: ("train_images", "training images per scene", "test"),
+    }
+    rows = {name: [row for row in results.rows(name) if row.get("status", OK) == OK] for name in files}
+    panels = {}
+    for name in files:
+        measured = [key for key in _LEARNING if any(np.isfinite(row.get(key, np.nan)) for row in rows[name])]
+        if measured:
+            panels[name] = measured[:_MAX_PANELS]
+    if not panels:
+        return
+    columns = max(map(len, panels.values()))
+    figure, axes = plt.subplots(len(panels), columns, figsize=(3.3 * columns, 2.9 * len(panels) + 0.6), squeeze=False)
+    for line, (name, keys) in zip(axes, panels.items(), strict=True):
+        x, title, split = files[name]
+        for axis in line[len(keys) :]:
+            axis.set_axis_off()
+        for axis, key in zip(line, keys, strict=False):
+            for method, style in _styles(results).items():
+                _curve(axis, [row for row in rows[name] if row["method"] == method], x, key, label(method), style)
+            axis.set_xscale("log")
+            _set_ticks(axis.xaxis)
+            if METRICS[key].direction == "lower":
+                axis.set_yscale("log")
+                _set_ticks(axis.yaxis)
+            if name == TRAINING_IMAGES:
+                axis.set_xticks(sorted({row[x] for row in rows[name]}))
+            axis.set(xlabel=title, title=f"{heading(key)}, {split} split")
+    handles: dict[str, Any] = {}
+    for axis in axes.flat:
+        handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
+    height = 0.25 * -(-len(handles) // (2 * columns)) / figure.get_figheight()
+    figure.legend(handles.values(), handles, loc="lower center", ncols=2 * columns)
+    figure.tight_layout(rect=(0, height, 1, 1))
+    plots.save(figure, results.directory, "learning_curves")
+
+
+def _set_ticks(axis: matplotlib.axis.Axis) -> None:
+    """Set the ticks of a logarithmic axis so that their labels do not overlap."""
+    low, high = axis.get_data_interval()
+    subs = (1, 2, 5) if high < 30 * low else (1,)
+    few = matplotlib.ticker.MaxNLocator(4)  # if powers of ten would give at most one tick
+    axis.set_major_locator(few if high < 5 * low else matplotlib.ticker.LogLocator(subs=subs))
+    axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    axis.set_minor_formatter(matplotlib.ticker.NullFormatter())
+
+
+def _styles(results: Results) -> dict[str, dict[str, Any]]:
+    """Return plot styles by method: a colour and a marker; methods of one curve of speed_accuracy are grey."""
+    families = curves(results)
+    styles = {m: plots.style(k) for k, m in enumerate(_alone(results, families))}
+    for members in families.values():
+        for k, (m, shade) in enumerate(zip(members, np.linspace(*_SHADES, len(members)), strict=True)):
+            styles[m] = {"color": str(shade), "ls": plots.DASHES[k % 4], "marker": "x+.12"[k % 5]}
+    return {m: styles[m] for m in results.methods}
+
+
+def _curve(axis: plt.Axes, rows: list[dict[str, Any]], x: str, key: str, name: str, style: dict[str, Any]) -> None:
+    """Draw the mean over seeds with a band of ± 1 standard deviation."""
+    values: dict[float, list[float]] = {}
+    for row in rows:
+        if np.isfinite(row.get(key, np.nan)):
+            values.setdefault(row[x], []).append(row[key])
+    if not values:
+        return
+    xs = sorted(values)
+    mean = np.array([np.mean(values[position]) for position in xs])
+    axis.plot(xs, mean, lw=1.2, ms=4, label=name, **style)
+    deviation = np.array([np.std(values[position], ddof=1) if len(values[position]) > 1 else 0 for position in xs])
+    if deviation.any():
+        axis.fill_between(xs, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, lw=0)

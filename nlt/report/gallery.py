@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,6 +16,7 @@ from nlt.report.plots import PICTURE, grid, plt, save, shown
 from nlt.report.table_writer import Table, write_texts
 
 FAILURES = "failures.csv"
+_ROWS = 6  # views in samples.webp
 _VIEWS = 3  # in qualitative.webp
 _INSET = 4  # image side / inset side
 WORST = 0.1  # fraction of a method's pixels
@@ -42,19 +42,27 @@ class Shown:
 
     @classmethod
     def load(cls, results: Results) -> Shown | None:
-        """Load the views; None if the images are on another machine or no method has any."""
+        """Load the views; None if the images are on another machine."""
         reference = results.images("reference")
         if reference is None:
             return None
         finished = [m for m in results.methods if results.runs_of(m)]
-        stored = {name: results.images(name) for name in ("noisy", *finished)}
+        stored = {"reference": reference, **{name: results.images(name) for name in ("noisy", *finished)}}
         images = {
             name: np.stack([shown(r, e) for r, e in zip(arrays["radiance"], reference["exposure"], strict=True)])
-            for name, arrays in {"reference": reference, **stored}.items()
+            for name, arrays in stored.items()
             if arrays is not None
         }
-        reference_shown, noisy = images.pop("reference"), images.pop("noisy")
-        return cls(results, reference_shown, noisy, images) if images else None
+        return cls(results, images.pop("reference"), images.pop("noisy"), images)
+
+    @property
+    def titles(self) -> list[str]:
+        """The titles of the images of a `row`."""
+        return ["Training image", *map(label, self.methods), "Reference"]
+
+    def row(self, view: int) -> list[np.ndarray]:
+        """Return the training image, every method's image and the reference of a view, (H, W, 3) each."""
+        return [self.noisy[view], *(images[view] for images in self.methods.values()), self.reference[view]]
 
     def error(self, method: str) -> np.ndarray:
         """Return the RMS difference over RGB between the displayed images, (V, H, W)."""
@@ -62,15 +70,14 @@ class Shown:
 
     @cached_property
     def scale(self) -> float:
-        """The error drawn brightest: the 99th percentile over all methods and views."""
-        return float(np.quantile([self.error(m) for m in self.methods], 0.99)) or 1.0
+        """The error drawn brightest: the 99th percentile over all methods and views, or 1 without any error."""
+        return float(np.quantile([self.error(m) for m in self.methods], 0.99) if self.methods else 1) or 1.0
 
     @cached_property
     def causes(self) -> dict[str, np.ndarray]:
         """The pixels (V, H, W) to which each of `CAUSES` applies; several may apply to a pixel.
 
-        Raises:
-            UserError: the images are from an older version.
+        Raises UserError if the images are from an older version.
         """
         buffers = self.results.images("gbuffer")
         assert buffers is not None
@@ -107,28 +114,33 @@ def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray,
     return edges
 
 
+def draw_samples(images: Shown) -> None:
+    """Draw samples.webp: a row per view, with the noisy training image, every method and the reference as displayed."""
+    views = np.unique(np.linspace(0, len(images.reference) - 1, _ROWS).round().astype(int))
+    figure, axes = grid(len(views), images.titles)
+    for line, view in zip(axes, views, strict=True):
+        for axis, image in zip(line, images.row(view), strict=True):
+            axis.imshow(image)
+    save(figure, images.results.directory, "samples", PICTURE)
+
+
 def draw_qualitative(images: Shown) -> None:
     """Draw qualitative.webp: each view's images, an inset where trained methods err most, and error maps."""
     trained = [m for m in images.methods if np.isfinite(images.results.mean(m, "train_s"))] or list(images.methods)
-    if not trained:
-        return
     errors = {m: images.error(m) for m in images.methods}
     size = images.reference.shape[1]
     side = max(size // _INSET, 4)
-    columns = ["Training image", *map(label, images.methods), "Reference"]
     views = np.unique(np.linspace(0, len(images.reference) - 1, _VIEWS).round().astype(int))
-    figure, axes = grid(3 * len(views), columns)
+    figure, axes = grid(3 * len(views), images.titles)
     for k, view in enumerate(views):
         mean = uniform_filter(np.mean([errors[m][view] for m in trained], axis=0), side, mode="nearest")
         inside = mean[side // 2 : size - side // 2, side // 2 : size - side // 2]
         top, left = np.unravel_index(inside.argmax(), inside.shape)
         crop = (slice(top, top + side), slice(left, left + side))
-        row = [images.noisy[view], *(m[view] for m in images.methods.values()), images.reference[view]]
-        for column, image in enumerate(row):
-            axes[3 * k][column].imshow(image, interpolation="nearest")
-            frame = plt.Rectangle((left - 0.5, top - 0.5), side, side, fill=False, ec="#D55E00", lw=0.8)
-            axes[3 * k][column].add_patch(frame)
-            axes[3 * k + 1][column].imshow(image[crop], interpolation="nearest")
+        for whole, inset, image in zip(axes[3 * k], axes[3 * k + 1], images.row(view), strict=True):
+            whole.imshow(image)
+            whole.add_patch(plt.Rectangle((left - 0.5, top - 0.5), side, side, fill=False, ec="#D55E00", lw=0.8))
+            inset.imshow(image[crop])
         for column, method in enumerate(images.methods, 1):
             drawn = axes[3 * k + 2][column].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
     bar = axes[-1][-1].inset_axes((0.1, 0.1, 0.15, 0.8))
@@ -161,7 +173,7 @@ def draw_failures(images: Shown) -> None:
         error = images.error(method)[view]
         pictures = (images.methods[method][view], images.reference[view], error, overlay)
         for axis, picture in zip(axes[:, column], pictures, strict=True):
-            axis.imshow(picture, interpolation="nearest", cmap="magma", vmin=0, vmax=images.scale)
+            axis.imshow(picture, cmap="magma", vmin=0, vmax=images.scale)
         for cause, mask in images.causes.items():
             rows.append({
                 "method": method, "cause": cause, "pixels": int((worst & mask).sum()),
@@ -181,23 +193,16 @@ def failures(results: Results) -> Table | None:
     path = results.directory / FAILURES
     if not path.exists():
         return None
-    by_method: dict[str, dict[str, dict[str, Any]]] = {}
-    for row in read_rows(path):
-        by_method.setdefault(row["method"], {})[row["cause"]] = row
-    causes = list(next(iter(by_method.values())))
-    everywhere = [next(iter(by_method.values()))[cause]["share_of_all"] for cause in causes]
-    counts = [
-        [
-            label(method),
-            *(f"{by_cause[cause]['share_of_worst']:.1%} ({by_cause[cause]['pixels']:,})" for cause in causes),
-        ]
-        for method, by_cause in by_method.items()
-    ]
+    cells = {(row["method"], row["cause"]): row for row in read_rows(path)}
+    methods, causes = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
+    text = lambda row: f"{row['share_of_worst']:.1%} ({row['pixels']:,})"
+    rows = [[label(method), *(text(cells[method, cause]) for cause in causes)] for method in methods]
+    rows.append(["all pixels", *(f"{cells[methods[0], cause]['share_of_all']:.1%}" for cause in causes)])
     return Table(
         "Causes of the worst pixels",
         f"Each method's worst tenth of the pixels in {len(results.manifest['shown'])} test views: the share to which a "
         "cause applies, and the number of these pixels. Several causes may apply to a pixel. If the share exceeds that "
         "of all pixels, the cause is associated with errors.",
         causes,
-        [*counts, ["all pixels", *(f"{share:.1%}" for share in everywhere)]],
+        rows,
     )

@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup, escape
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.claims import BELOW_FLOOR, Claim, Inequality
+from nlt.evaluation.claims import BELOW_FLOOR, Claim
 from nlt.evaluation.claims import text as claim_text
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
@@ -93,7 +93,9 @@ def write_page(
     content = {
         "results": results,
         "title": f"{name}: {paper()[table]['title']}" if (table := results.manifest["table"]) else name,
-        "facts": _facts(results),
+        "limit": limit,
+        "max_error": max_error,
+        "commit": _commit(results),
         "problems": [f"{label(m)}: {results.status(m)}" for m in results.methods if results.status(m) != OK],
         "marks": _MARKS,
         "counts": Counter(claim.verdict for claim in claims),
@@ -112,10 +114,10 @@ def write_page(
     }
     page = partial(_environment().get_template("template.html").render, content)
     if views:
-        frame = page(data=data, note=_note(results, data, limit))
+        frame = page(data=data)
         data["pictures"], data["steps"] = pack_to_fit(views, int(limit * 1e6) - len(frame.encode()))
         data["views"] = data["views"][: len(data["pictures"])]
-    write_bytes(results.directory / PAGE, page(data=data, note=_note(results, data, limit)).encode())
+    write_bytes(results.directory / PAGE, page(data=data).encode())
 
 
 def _environment() -> Environment:
@@ -139,18 +141,18 @@ def _environment() -> Environment:
 
 def _quantities(results: Results) -> dict[str, dict[str, Any]]:
     everywhere = [results.on(device) for device in results.devices]
-    measured = [key for key in QUANTITIES if any(len(on.values(m, key)) for on in everywhere for m in results.methods)]
-    quantities = {
+    quantities: dict[str, dict[str, Any]] = {
         key: {
             "heading": heading(key),
             "axis": heading(key),
-            "direction": QUANTITIES[key].direction,
-            "scale": QUANTITIES[key].scale,
-            "unit": QUANTITIES[key].unit,
+            "direction": quantity.direction,
+            "scale": quantity.scale,
+            "unit": quantity.unit,
             "role": "metric" if key in METRICS and key != "reference_noise" else "cost" if key in _AXES else "",
-            "per_image": QUANTITIES[key].per_image,
+            "per_image": quantity.per_image,
         }
-        for key in measured
+        for key, quantity in QUANTITIES.items()
+        if any(len(on.values(method, key)) for on in everywhere for method in results.methods)
     }
     if time := quantities.get("time_per_frame_s"):
         time |= {"axis": "time per frame (ms)", "unit": "ms", "scale": 1e3}
@@ -198,7 +200,7 @@ def _images(results: Results) -> tuple[list[np.ndarray], dict[str, Any]]:
         images["albedo"] = ("Albedo", "albedo", gbuffer["albedo"])
         images["normal"] = ("Normals", "normal", gbuffer["normal"] / 2 + 0.5)
     views = [np.stack(arrays) for arrays in zip(*(array for _, _, array in images.values()), strict=True)]
-    displayed = Shown.load(results)
+    shown = Shown.load(results)
     return views, {
         "images": [{"id": name, "label": title, "kind": kind} for name, (title, kind, _) in images.items()],
         "height": views[0].shape[-2],
@@ -207,7 +209,7 @@ def _images(results: Results) -> tuple[list[np.ndarray], dict[str, Any]]:
         "steps": 1,
         "stored": len(views),
         "pictures": [],
-        "error_scale": float(f"{displayed.scale:.3g}") if displayed else 1.0,
+        "error_scale": float(f"{shown.scale:.3g}") if shown else 1.0,
         "colours": matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].tolist(),
         "views": [
             {"view": int(view), "exposure": float(e), "metrics": _view_metrics(results, int(view), list(images))}
@@ -234,23 +236,9 @@ def _view_metrics(results: Results, view: int, names: list[str]) -> dict[str, di
 # --- parts of the page that need no script ---
 
 
-def _facts(results: Results) -> list[str]:
-    manifest = results.manifest
-    seeds = len(manifest["seeds"])
-    facts = [
-        f"{len(results.methods)} methods",
-        f"{manifest['n_test']} test views",
-        f"{seeds} seed{'s' * (seeds > 1)}",
-        ", ".join(manifest.get("scenes", [manifest.get("dataset", "")])),
-        manifest.get("device", ""),
-        f"commit {_commit(manifest)}",
-    ]
-    return [fact for fact in facts if fact]
-
-
-def _commit(manifest: Any) -> str:
-    commit = str(manifest.get("commit") or "unknown")[:12]
-    return commit + (" with uncommitted changes" if manifest.get("uncommitted_changes") else "")
+def _commit(results: Results) -> str:
+    commit = str(results.manifest.get("commit") or "unknown")[:12]
+    return f"commit {commit}" + " with uncommitted changes" * bool(results.manifest.get("uncommitted_changes"))
 
 
 def _results_grid(results: Results, table: Table, number: int) -> _Grid:
@@ -273,19 +261,14 @@ def _results_grid(results: Results, table: Table, number: int) -> _Grid:
 
 def _measurement(results: Results) -> str:
     manifest = results.manifest
-    facts = [
-        f"N = {manifest['n_test']} test views",
-        manifest.get("device", ""),
-        f"commit {_commit(manifest)}",
-        manifest.get("command", ""),
-    ]
+    facts = [f"N = {manifest['n_test']} test views", manifest.get("device"), _commit(results), manifest.get("command")]
     return "; ".join(filter(None, facts))
 
 
 def _column_origin(results: Results, key: str, source: Results) -> str:
     """Return the file and the column that a table's column comes from."""
     if source is not results:
-        return f"timings.csv, column {key}, {source.manifest['device']}, commit {_commit(source.manifest)}"
+        return f"timings.csv, column {key}, {source.manifest['device']}, {_commit(source)}"
     return f"runs.csv, column {key}" + (f"; interval: views.csv, column {key}" if QUANTITIES[key].per_image else "")
 
 
@@ -323,21 +306,14 @@ def _failures_grid(results: Results) -> _Grid | None:
 
 
 def _claim_grid(results: Results, claim: Claim) -> _Grid:
-    rows = [[label(c.method), label(c.other), heading(c.metric), _margin(c), _verdict(c)] for c in claim.comparisons]
+    rows = []
+    for c in claim.comparisons:
+        margin = f"{c.margin:+.3g} [{c.low:+.3g}, {c.high:+.3g}]" if math.isfinite(c.margin) else "–"
+        verdict = f"{_MARKS[c.verdict]} {c.verdict}" + f"; {BELOW_FLOOR}" * c.below_floor
+        rows.append([label(c.method), label(c.other), heading(c.metric), margin, verdict])
     table = Table(f"Comparisons of {claim.id}", "", ["against", "metric", "margin", "verdict"], rows)
     origin = f"claims.json; computed from runs.csv and views.csv, {_measurement(results)}"
     return _Grid(f"comparisons-{claim.id}", table, origin)
-
-
-def _verdict(comparison: Inequality) -> str:
-    below = f"; {BELOW_FLOOR}" if comparison.below_floor else ""
-    return f"{_MARKS[comparison.verdict]} {comparison.verdict}{below}"
-
-
-def _margin(comparison: Inequality) -> str:
-    if not math.isfinite(comparison.margin):
-        return "–"
-    return f"{comparison.margin:+.3g} [{comparison.low:+.3g}, {comparison.high:+.3g}]"
 
 
 def _runs_grid(results: Results) -> _Grid:
@@ -351,20 +327,6 @@ def _runs_grid(results: Results) -> _Grid:
     cells = [["" for _ in _RUN] + [_plain(run.get(key)) for key in keys] for run in results.runs]
     table = Table("All runs", "", [*_RUN, *map(heading, keys)], rows)
     return _Grid("runs", table, _measurement(results), columns, cell_origins=cells)
-
-
-def _note(results: Results, data: dict[str, Any], megabytes: float) -> str:
-    """Return what the page says about the number and the precision of its images."""
-    if not data["views"]:
-        return "No images are stored with these results; they are in images/ on the machine that made them."
-    shown, stored = len(data["pictures"]), data["stored"]
-    subset = f"{shown} of {stored} stored views, so that this file stays below {megabytes:g} MB; "
-    error = max_error(data["steps"])
-    return (
-        (subset if shown < stored else f"{stored} views; ")
-        + f"linear radiance accurate to {100 * error:.2g} % ({255 * 1.055 / 2.4 * error:.2g} of 255 display levels); "
-        f"images and their metrics are from seed {results.manifest['seeds'][0]}."
-    )
 
 
 # --- what the template calls ---

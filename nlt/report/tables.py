@@ -21,22 +21,19 @@ _BOUNDED = ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1")
 
 def write_tables(results: Results) -> None:
     """Write table.csv with unrounded numbers, table.md and table.tex."""
-    rows = [_summary(results, method) for method in results.methods]
+    n_test, rows = results.manifest["n_test"], []
+    for method in results.methods:
+        row: dict[str, Any] = {"method": method, "status": results.status(method), "n_test": n_test}
+        row["seeds"] = len(results.runs_of(method))
+        for key in _measured(results, dict.fromkeys((*COLUMNS, *QUANTITIES))):
+            row |= {key: results.mean(method, key), f"{key}_std": results.std(method, key)}
+            if QUANTITIES[key].per_image:
+                row[f"{key}_low"], row[f"{key}_high"] = results.interval(method, key)
+        rows.append(row)
     if results.floor:
-        rows.append({"method": FLOOR, "status": OK, "n_test": results.manifest["n_test"], **results.floor})
+        rows.append({"method": FLOOR, "status": OK, "n_test": n_test, **results.floor})
     write_rows(results.directory / "table.csv", rows)
     write_texts(results.directory / "table", tables(results), "runs.csv, views.csv")
-
-
-def _summary(results: Results, method: str) -> dict[str, Any]:
-    """Return a method's row of table.csv: mean, standard deviation and interval of each measured quantity."""
-    counts = {"n_test": results.manifest["n_test"], "seeds": len(results.runs_of(method))}
-    row: dict[str, Any] = {"method": method, "status": results.status(method), **counts}
-    for key in _measured(results, dict.fromkeys((*COLUMNS, *QUANTITIES))):
-        row |= {key: results.mean(method, key), f"{key}_std": results.std(method, key)}
-        if QUANTITIES[key].per_image:
-            row[f"{key}_low"], row[f"{key}_high"] = results.interval(method, key)
-    return row
 
 
 def tables(results: Results) -> list[Table]:

