@@ -19,7 +19,7 @@ from nlt.errors import UserError
 from nlt.scenes import mitsuba_xml
 from nlt.scenes.meshes import bsdf, curved, emitter, live_mesh
 from nlt.scenes.mitsuba_xml import LAMP_RADIUS, unique
-from nlt.scenes.model import Material, Model, named_files, read_gltf, read_obj
+from nlt.scenes.model import Material, named_files, read_gltf, read_obj
 
 SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 
@@ -34,13 +34,8 @@ class Imported:
     up: str | None = None
 
 
-def load(path: Path) -> Any:
-    """Return the file as a `mi.Scene` of meshes. The same file always gives the same scene."""
-    return read(path).scene
-
-
 def read(path: Path) -> Imported:
-    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the active variant.
+    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the active variant, always as the same scene.
 
     Raises:
         UserError: the file has another format, it refers to missing files (all are listed), or Mitsuba refuses it.
@@ -51,45 +46,43 @@ def read(path: Path) -> Imported:
         raise UserError(f"{path}: {problem}; give a file ending in {', '.join(SUFFIXES)}")
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: {suffix or 'no suffix'}: nlt reads scene files ending in {', '.join(SUFFIXES)}")
-    imported = _read_xml(path) if suffix == ".xml" else _read_model(path)
-    if not imported.scene.shapes():
-        raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in imported.warnings)}")
-    return imported
+    camera = up = None
+    if suffix == ".xml":
+        scene, counts, camera = _read_xml(path)
+        if camera is not None:
+            axis = int(np.abs(camera[:3, 1]).argmax())
+            up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
+    else:
+        scene, counts = _read_model(path)
+        up = None if suffix == ".obj" else "y"
+    warnings = tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(counts.items()))
+    if not scene.shapes():
+        raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in warnings)}")
+    return Imported(scene, warnings, camera, up)
 
 
-def check_missing(path: Path, missing: list[str]) -> None:
-    """Raise one UserError that lists all missing files, if any."""
+def _check_missing(path: Path, missing: list[str]) -> None:
     if missing:
         raise UserError(f"{path}: missing: {', '.join(sorted(missing))}; add them, paths are relative to {path.parent}")
 
 
-def _read_xml(path: Path) -> Imported:
+def _read_xml(path: Path) -> tuple[Any, Counter[str], np.ndarray | None]:
+    """Return the scene, counts of warnings and the pose (4, 4) of the file's camera, if it has one."""
     document = mitsuba_xml.read(path)
-    check_missing(path, document.missing)
+    _check_missing(path, document.missing)
     pose = None if document.sensor is None else document.sensor.find("transform")
     with tempfile.TemporaryDirectory() as folder, _reporting(path, document.warnings):
         for shape in document.root.findall("shape"):
             if shape.get("type") in mitsuba_xml.ANALYTIC:
                 _to_mesh_file(shape, Path(folder))
         scene = _instantiate(document.root)
-        camera = None if pose is None else _pose(pose)
-    up = None
-    if camera is not None:
-        axis = int(np.abs(camera[:3, 1]).argmax())
-        up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
-    return Imported(scene, _format_warnings(document.warnings), camera, up)
+        return scene, document.warnings, None if pose is None else _pose(pose)
 
 
-def _read_model(path: Path) -> Imported:
-    check_missing(path, [name for name in named_files(path) if not (path.parent / name).is_file()])
-    is_obj = path.suffix.lower() == ".obj"
-    model = read_obj(path) if is_obj else read_gltf(path)
-    scene = _build(model)
-    return Imported(scene, _format_warnings(model.warnings), up=None if is_obj else "y")
-
-
-def _build(model: Model) -> Any:
-    """Build a scene of a model's parts, under their names, with a small sphere for every lamp."""
+def _read_model(path: Path) -> tuple[Any, Counter[str]]:
+    """Return the scene, with a small sphere for every lamp, and counts of warnings."""
+    _check_missing(path, [name for name in named_files(path) if not (path.parent / name).is_file()])
+    model = read_obj(path) if path.suffix.lower() == ".obj" else read_gltf(path)
     parts = list(model.parts)
     for name, position, intensity in model.lamps:
         placed = np.diag([LAMP_RADIUS, LAMP_RADIUS, LAMP_RADIUS, 1])
@@ -107,11 +100,7 @@ def _build(model: Model) -> Any:
         light = emitter(material)
         live = None if light is None else mi.load_dict(light)
         meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], live)
-    return mi.load_dict({"type": "scene", **meshes})
-
-
-def _format_warnings(warnings: Counter[str]) -> tuple[str, ...]:
-    return tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
+    return mi.load_dict({"type": "scene", **meshes}), model.warnings
 
 
 class _WarningCounter(mi.Appender):
