@@ -198,10 +198,10 @@ class Renderer:
             uniform = np.random.default_rng(0).random((_PILOT, 5), np.float32)
             with self.scene.in_state(lit):
                 casts = [self._cast(k, uniform) for k in range(len(self.emitters))]
-            power = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
+            powers = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
             # Assume at least one arrival, so that an emitter that seems to light nothing still gets a few photons.
-            arrivals = [max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts]
-            self._pilots[lit.key] = np.array(power), np.array(arrivals)
+            shares = [max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts]
+            self._pilots[lit.key] = np.array(powers), np.array(shares)
         power, reach = self._pilots[lit.key]
         share = power / power.sum()
         # Systematic resampling: each emitter gets its share of the photons, rounded at random.

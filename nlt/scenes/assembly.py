@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from nlt.errors import UserError
-from nlt.scenes import importer
 from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, SceneDescription
+from nlt.scenes.importer import read
 from nlt.scenes.lanes import is_jit, owned
 from nlt.scenes.masks import is_mask
 from nlt.scenes.meshes import live_mesh
@@ -226,7 +226,7 @@ def load_source(description: SceneDescription) -> Any:
             known = ", ".join(builtin.BUILTINS)
             raise UserError(f"{description.file}: source: no built-in scene {name!r}; known are {known}")
         return builtin.mitsuba_scene(name)
-    return importer.read(description.path).scene
+    return read(description.path).scene
 
 
 def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True) -> Shape:

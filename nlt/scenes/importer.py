@@ -17,7 +17,7 @@ import numpy as np
 
 from nlt.errors import UserError
 from nlt.scenes import mitsuba_xml
-from nlt.scenes.meshes import bsdf, curved, emitter, live_mesh
+from nlt.scenes.meshes import bsdf, curved, live_mesh, texture
 from nlt.scenes.mitsuba_xml import LAMP_RADIUS, unique
 from nlt.scenes.model import Material, named_files, read_gltf, read_obj
 
@@ -87,8 +87,8 @@ def _read_model(path: Path) -> tuple[Any, Counter[str]]:
     for name, position, intensity in model.lamps:
         placed = np.diag([LAMP_RADIUS, LAMP_RADIUS, LAMP_RADIUS, 1])
         placed[:3, 3] = position
-        radiance = tuple(intensity / (np.pi * LAMP_RADIUS**2))
-        parts.append((name, curved("sphere").moved(placed), Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
+        glow = Material(colour=(0.0, 0.0, 0.0), emission=tuple(intensity / (np.pi * LAMP_RADIUS**2)))
+        parts.append((name, curved("sphere").moved(placed), glow))
     bsdfs: dict[int, Any] = {}  # one per material, because each instance costs tracing time
     meshes: dict[str, Any] = {}
     for name, triangles, material in parts:
@@ -97,9 +97,11 @@ def _read_model(path: Path) -> tuple[Any, Counter[str]]:
         key = unique(re.sub(r"\W", "_", name), meshes)
         if id(material) not in bsdfs:
             bsdfs[id(material)] = mi.load_dict(bsdf(material))
-        light = emitter(material)
-        live = None if light is None else mi.load_dict(light)
-        meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], live)
+        light = None
+        if any(material.emission):
+            radiance = texture(material.emission, material.emission_image)
+            light = mi.load_dict({"type": "area", "radiance": radiance})
+        meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], light)
     return mi.load_dict({"type": "scene", **meshes}), model.warnings
 
 

@@ -297,7 +297,7 @@ class _Floor:
     def occupied(self, points: np.ndarray) -> np.ndarray:
         """Return whether there are points in each cell."""
         edges = [low + self.cell * np.arange(n + 1) for low, n in zip(self.low, self.shape, strict=True)]
-        return np.histogram2d(*points[:, :2].T, bins=edges)[0] > 0
+        return np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
 
     def rectangle(self, box: np.ndarray, margin: int = 0) -> tuple[slice, ...]:
         """Return the cells below a box (2, 3), with a margin around them."""

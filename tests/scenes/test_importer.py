@@ -481,7 +481,7 @@ def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):
     for name in ("good", "far"):
         write_yaml(tmp_path / f"{name}.yaml", **({"source": "far/scene.xml"} if name == "far" else {}))
     write(tmp_path / "broken.yaml", "camera: [1\n")
-    for module in ("nlt.paths", "nlt.scenes.catalog"):
+    for module in ("nlt.paths", "nlt.scenes.description"):
         monkeypatch.setattr(f"{module}.config_names", lambda kind: ["broken", "far", "good"])
     monkeypatch.setattr("nlt.scenes.description.find_config", lambda kind, name: tmp_path / f"{name}.yaml")
     assert main(["scenes", "list"]) == 0
