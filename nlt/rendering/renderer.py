@@ -69,15 +69,12 @@ class Renderer:
         Returns:
             (3, H, W) float32 for the whole image, else (3, n).
         """
-        if pixels is not None:
-            return self._trace(camera, spp, seed, pixels)
-        if not is_jit():
-            # A Python loop over paths takes longer than a whole image in C++, unless few pixels are requested.
-            return self._scalar_image(camera, spp, seed)
-        image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
-        return image.reshape(3, camera.height, camera.width)
-
-    def _trace(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray) -> np.ndarray:
+        shape = (3, camera.height, camera.width) if pixels is None else (3, -1)
+        if pixels is None:
+            if not is_jit():
+                # A Python loop over paths takes longer than a whole image in C++, unless few pixels are requested.
+                return self._scalar_image(camera, spp, seed)
+            pixels = np.arange(camera.width * camera.height)
         corner = np.stack([pixels % camera.width, pixels // camera.width], 1).astype(np.float32)
         total = np.zeros((len(pixels), 3))
         batch = max(1, min(spp, _MAX_LANES // max(len(pixels), 1)))
@@ -100,7 +97,7 @@ class Renderer:
                 lit = value.any(1)
                 image = [np.bincount(pixel[lit], channel, camera.width * camera.height) for channel in value[lit].T]
                 total += np.stack(image, 1)[pixels] / len(pixels)
-        return (total / spp).T.astype(np.float32)
+        return (total / spp).T.astype(np.float32).reshape(shape)
 
     def _scalar_image(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
         sensor = mi.load_dict({

@@ -76,7 +76,7 @@ def _read_xml(path: Path) -> tuple[Any, Counter[str], np.ndarray | None]:
             if shape.get("type") in mitsuba_xml.ANALYTIC:
                 _to_mesh_file(shape, Path(folder))
         scene = _instantiate(document.root)
-        return scene, document.warnings, None if pose is None else _pose(pose)
+        return scene, document.warnings, None if pose is None else _probe("disk", [pose])[1]
 
 
 def _read_model(path: Path) -> tuple[Any, Counter[str]]:
@@ -143,40 +143,34 @@ def _reporting(path: Path, warnings: Counter[str]) -> Iterator[None]:
             logger.add_appender(appender)
 
 
-def _parse(root: ET.Element) -> tuple[Any, Any]:
-    """Return the configuration and the result of Mitsuba's parser. Shapes are not merged and keep their ids."""
+def _instantiate(root: ET.Element) -> Any:
+    """Instantiate a scene with Mitsuba's parser, which upgrades old names. Shapes are not merged and keep their ids."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     config.merge_equivalent = config.merge_meshes = False
     config.unused_properties = mi.LogLevel.Warn
-    return config, mi.parser.parse_string(config, ET.tostring(root, encoding="unicode"))
-
-
-def _instantiate(root: ET.Element) -> Any:
-    """Instantiate a scene with Mitsuba's parser, which upgrades old names."""
-    config, state = _parse(root)
+    state = mi.parser.parse_string(config, ET.tostring(root, encoding="unicode"))
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)
 
 
-def _pose(transform: ET.Element) -> np.ndarray:
-    """Return the matrix (4, 4) of a `<transform>`, as Mitsuba reads it."""
+def _probe(kind: str, place: list[ET.Element]) -> tuple[Any, np.ndarray | None]:
+    """Return an analytic shape at its transform, centre, radius or ends, and its matrix (4, 4) unless it is a mesh."""
     root = ET.Element("scene", version=mitsuba_xml.OLD)
-    ET.SubElement(root, "sensor", type="perspective").append(transform)
-    _, state = _parse(root)
-    return np.array(state.nodes[1].props[transform.get("name", "")].matrix, float).reshape(4, 4)
+    ET.SubElement(root, "shape", type=kind).extend(place)
+    (shape,) = _instantiate(root).shapes()
+    if isinstance(shape, mi.Mesh):  # a rectangle or a cube
+        return shape, None
+    return shape, np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
 
 
 def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
-    """Replace an analytic shape by a mesh file; Mitsuba derives the placement from its centre, radius and ends."""
+    """Replace an analytic shape by a mesh file."""
     kind, file = shape.get("type", ""), str(folder / f"{shape.get('id')}.ply")
-    place = [c for c in shape if c.tag in ("transform", "point", "float")]
-    root = ET.Element("scene", version=mitsuba_xml.OLD)
-    ET.SubElement(root, "shape", type=kind).extend(place)
-    (probe,) = _instantiate(root).shapes()
-    if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices are not among the scene's parameters
-        probe.write_ply(file)
+    place = [child for child in shape if child.tag in ("transform", "point", "float")]
+    exact, matrix = _probe(kind, place)
+    if matrix is None:
+        exact.write_ply(file)
     else:
-        matrix = np.array(mi.traverse(probe)["to_world"].matrix, float).reshape(4, 4)
         live_mesh(kind, curved(kind).moved(matrix)).write_ply(file)
     for child in place:
         shape.remove(child)

@@ -110,5 +110,5 @@ def _channel(factor: float, image: Image.Image | None, band: int, cutoff: float 
         return factor if cutoff is None else float(factor >= cutoff)
     bands = np.asarray(image.convert("L") if len(image.getbands()) == 1 else image.convert("RGB"), np.float32) / 255
     values = factor * (bands if bands.ndim == 2 else bands[..., band])
-    values = (values if cutoff is None else values >= cutoff).astype(np.float32)[..., None]
-    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
+    rounded = values if cutoff is None else values >= cutoff
+    return {"type": "bitmap", "bitmap": mi.Bitmap(rounded.astype(np.float32)[..., None]), "raw": True}

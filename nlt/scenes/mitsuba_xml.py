@@ -26,8 +26,7 @@ _MESHES = ("obj", "ply", "serialized")
 _MEDIA = ("medium", "subsurface")
 _DROPPED = ("sensor", "integrator", "film", "sampler", "rfilter", "phase", "volume")
 _ENVIRONMENTS = ("envmap", "constant", "sunsky", "timed_sunsky")
-_LAMPS = {"point": "sphere", "spot": "disk"}  # the shapes of the small lamps that replace these lights
-LAMP_RADIUS = 0.05  # scene units
+LAMP_RADIUS = 0.05  # scene units; of the spheres that replace point and spot lights
 
 
 @dataclass
@@ -208,14 +207,12 @@ def _value(element: ET.Element) -> None:
     elif element.tag == "spectrum" and value and ":" not in value:
         element.tag = "rgb"  # one or three plain numbers, which the RGB mode of Mitsuba 0.x read as linear RGB
     elif element.tag == "srgb" or (element.tag == "rgb" and value.startswith("#")):
-        is_hex = value.startswith("#")
-        encoded = np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255 if is_hex else _numbers(element)
+        if value.startswith("#"):
+            encoded = np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255
+        else:
+            encoded = np.array(re.split(r"[\s,]+", value), float)
         element.tag = "rgb"
         element.set("value", ", ".join(f"{v:.6g}" for v in linear(encoded)))
-
-
-def _numbers(element: ET.Element) -> np.ndarray:
-    return np.array(re.split(r"[\s,]+", element.get("value", "").strip()), float)
 
 
 def _texture(element: ET.Element) -> None:
@@ -247,31 +244,26 @@ def _convert_lights(document: Document, root: ET.Element) -> None:
         root.remove(element)
         if element.get("type") in _ENVIRONMENTS:
             text = f"Mitsuba allows one environment: {kept} is kept, {kind} ignored"
-        elif kind in _LAMPS:
+        elif kind in ("point", "spot"):
             root.append(_lamp(element))
-            text = f"a {kind} light is replaced by a {_LAMPS[kind]} of radius {LAMP_RADIUS:g} and the same intensity"
+            text = f"a {kind} light is replaced by a sphere of radius {LAMP_RADIUS:g} and the same intensity"
         else:
             text = f"a {kind} light is ignored: nlt has only area lights and environments"
         document.warnings[text] += 1
 
 
 def _lamp(light: ET.Element) -> ET.Element:
-    """Return a small area light as bright as a point or spot light."""
-    kind = light.get("type", "")
-    lamp = ET.Element("shape", type=_LAMPS[kind], id=light.get("id", f"{kind}_light"))
+    """Return a small sphere as bright as a point or spot light."""
+    lamp = ET.Element("shape", type="sphere", id=light.get("id", f"{light.get('type')}_light"))
     lamp.extend(light.findall("transform"))
+    _set(lamp, "float", "radius", LAMP_RADIUS)
     position, intensity = _property(light, "position"), _property(light, "intensity")
     if position is not None:
         position.set("name", "center")
         lamp.append(position)
-    if kind == "point":
-        _set(lamp, "float", "radius", LAMP_RADIUS)
-    else:
-        _transform(lamp).insert(0, ET.Element("scale", value=str(LAMP_RADIUS)))
     values = re.split(r"[\s,]+", "1" if intensity is None else intensity.get("value", "1").strip())
     radiance = [float(v.split(":")[-1]) / (np.pi * LAMP_RADIUS**2) for v in values]
-    emitter = ET.SubElement(lamp, "emitter", type="area")
-    _set(emitter, "rgb", "radiance", ", ".join(f"{v:.6g}" for v in radiance))
+    _set(ET.SubElement(lamp, "emitter", type="area"), "rgb", "radiance", ", ".join(f"{v:.6g}" for v in radiance))
     return lamp
 
 

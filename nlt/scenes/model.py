@@ -184,6 +184,7 @@ def _gltf_surface(
         return Material((1.0, 1.0, 1.0)), uv
     source = int(visual.material.name)
     material, loaded = converted[source], visual.material
+    assert isinstance(loaded, trimesh.visual.material.PBRMaterial)
     material.image, material.rough_image = loaded.baseColorTexture, loaded.metallicRoughnessTexture
     material.emission_image = loaded.emissiveTexture
     if material.image is not None and loaded.alphaMode in ("MASK", "BLEND") and "A" in material.image.getbands():
@@ -266,10 +267,10 @@ def read_obj(path: Path) -> Model:
         for (name, material_name), faces in parts.items():
             if material_name not in materials:
                 model.warnings[f"material {material_name or '(none)'} is not in the MTL files: replaced by grey"] += 1
-            corners, inverse = np.unique(np.array(faces).reshape(-1, 3), axis=0, return_inverse=True)
+            unique, inverse = np.unique(np.array(faces).reshape(-1, 3), axis=0, return_inverse=True)
             vertices, uv, normals = (
-                np.array([array[k] for k in column]) if (column >= 0).all() else None
-                for column, array in zip(corners.T, arrays.values(), strict=True)
+                np.array([array[k] for k in indices]) if (indices >= 0).all() else None
+                for indices, array in zip(unique.T, arrays.values(), strict=True)
             )
             if vertices is None:
                 raise ValueError("a face without vertices")

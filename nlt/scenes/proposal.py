@@ -90,10 +90,8 @@ class _Rays:
     def __call__(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the distances (n,) to the first hits of rays (n, 3), inf for rays that hit nothing."""
         kernel = lambda origin, direction: (self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction)).t,)
-        origins, directions = np.broadcast_arrays(origins, directions)
-        back = np.argsort(self.order)
-        lanes = {"origin": ("Point3f", origins[:, back]), "direction": ("Vector3f", directions[:, back])}
-        return launch(kernel, lanes)[0].astype(float)
+        rays = np.stack(np.broadcast_arrays(origins, directions))[..., np.argsort(self.order)]
+        return launch(kernel, {"origin": ("Point3f", rays[0]), "direction": ("Vector3f", rays[1])})[0].astype(float)
 
 
 def _box(points: np.ndarray) -> np.ndarray:
@@ -111,8 +109,7 @@ def _guess_up(shapes: Mapping[str, Shape]) -> str:
 
 def _grid(box: np.ndarray, layers: tuple[int, int, int]) -> np.ndarray:
     """Cell centres (n, 3) of a regular grid in a box."""
-    cells = np.stack(np.meshgrid(*map(np.arange, layers), indexing="ij"), axis=-1).reshape(-1, 3)
-    return box[0] + (box[1] - box[0]) * (cells + 0.5) / layers
+    return box[0] + (box[1] - box[0]) * (np.indices(layers).reshape(3, -1).T + 0.5) / layers
 
 
 def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
@@ -243,7 +240,7 @@ class _Furniture:
         own = np.concatenate([self.points[n] for n in names])
         others = np.concatenate([np.empty((0, 3)), *(p for n, p in self.points.items() if n not in names)])
         box = _box(own)
-        floor = _Floor(box + reach * _OUTWARD, cell)
+        floor = _Floor(box, reach, cell)
         blocked = floor.occupied(others[(others[:, 2] > box[0, 2] + 2 * cell) & (others[:, 2] < box[1, 2] - cell)])
         blocked[floor.rectangle(box)] = False
         centres = floor.centres(box[0, 2] + cell)
@@ -255,14 +252,14 @@ class _Furniture:
         ring[floor.rectangle(feet, margin=2)] = True
         ring &= ~under & ~outside  # only around its feet: under them, rays would hit the group itself
         if ring.any() and carried[ring].mean() > 0.5:
-            return floor.room_to_move(blocked | outside | (~carried & ~under), box, reach)
+            return floor.room_to_move(blocked | outside | (~carried & ~under), reach)
         if box[1, 2] > room[1, 2] - 3 * cell and box[1, 2] - box[0, 2] < 0.5 * self.height:  # a lamp on the ceiling
-            return floor.room_to_move(blocked | outside, box, reach / 3)
-        return self._along_wall(floor, box, others)
+            return floor.room_to_move(blocked | outside, reach / 3)
+        return self._along_wall(floor, others)
 
-    def _along_wall(self, floor: _Floor, box: np.ndarray, others: np.ndarray) -> np.ndarray | None:
+    def _along_wall(self, floor: _Floor, others: np.ndarray) -> np.ndarray | None:
         """Return the translations (2, 3) of a group that hangs on a wall, or None if it does not."""
-        room, cell = self.room, self.cell
+        room, box, cell = self.room, floor.box, self.cell
         thin = int(np.ptp(box, axis=0)[:2].argmin())
         gaps = np.abs(box[:, thin] - room[:, thin])
         if np.ptp(box[:, thin]) > 0.1 * self.height or gaps.min() > 0.06 * self.height:
@@ -275,14 +272,15 @@ class _Furniture:
         blocked = (along < room[0, 1 - thin]) | (along > room[1, 1 - thin])
         blocked |= floor.occupied(others[level]).any(thin, keepdims=True)
         blocked[floor.rectangle(box)] = False
-        return floor.room_to_move(blocked, box, _REACH * self.height / 3, axes=(1 - thin,))
+        return floor.room_to_move(blocked, _REACH * self.height / 3, axes=(1 - thin,))
 
 
 class _Floor:
-    """A horizontal grid of square cells that covers a box `area` (2, 3)."""
+    """A horizontal grid of square cells around a `box` (2, 3), up to a distance of `reach`."""
 
-    def __init__(self, area: np.ndarray, cell: float) -> None:
-        self.low, self.cell = area[0, :2], cell
+    def __init__(self, box: np.ndarray, reach: float, cell: float) -> None:
+        area = box + reach * _OUTWARD
+        self.box, self.low, self.cell = box, area[0, :2], cell
         self.shape = np.ceil(np.ptp(area, axis=0)[:2] / cell).astype(int)
 
     def centres(self, height: float) -> np.ndarray:
@@ -304,11 +302,9 @@ class _Floor:
         first, last = self._cells(box)
         return tuple(slice(max(a - margin, 0), b + margin + 1) for a, b in zip(first, last, strict=True))
 
-    def room_to_move(
-        self, blocked: np.ndarray, box: np.ndarray, most: float, axes: tuple[int, ...] = (0, 1)
-    ) -> np.ndarray:
-        """Return the translations (2, 3), each at most `most` long, that keep a box (2, 3) out of all blocked cells."""
-        blocked, corners = np.pad(blocked, 1, constant_values=True), self._cells(box) + 1
+    def room_to_move(self, blocked: np.ndarray, most: float, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
+        """Return the translations (2, 3), each at most `most` long, that keep the box out of all blocked cells."""
+        blocked, corners = np.pad(blocked, 1, constant_values=True), self._cells(self.box) + 1
         steps = np.zeros((2, 2), int)
         growing = [(side, k) for k in axes for side in (0, 1)]
         while growing:
