@@ -26,7 +26,8 @@ _MESHES = ("obj", "ply", "serialized")
 _MEDIA = ("medium", "subsurface")
 _DROPPED = ("sensor", "integrator", "film", "sampler", "rfilter", "phase", "volume")
 _ENVIRONMENTS = ("envmap", "constant", "sunsky", "timed_sunsky")
-LAMP_RADIUS = 0.05  # scene units; of the spheres that replace point and spot lights
+_LAMPS = {"point": "sphere", "spot": "disk"}  # the shapes of the small lamps that replace these lights
+LAMP_RADIUS = 0.05  # scene units
 
 
 @dataclass
@@ -244,19 +245,23 @@ def _convert_lights(document: Document, root: ET.Element) -> None:
         root.remove(element)
         if element.get("type") in _ENVIRONMENTS:
             text = f"Mitsuba allows one environment: {kept} is kept, {kind} ignored"
-        elif kind in ("point", "spot"):
+        elif kind in _LAMPS:
             root.append(_lamp(element))
-            text = f"a {kind} light is replaced by a sphere of radius {LAMP_RADIUS:g} and the same intensity"
+            text = f"a {kind} light is replaced by a {_LAMPS[kind]} of radius {LAMP_RADIUS:g} and the same intensity"
         else:
             text = f"a {kind} light is ignored: nlt has only area lights and environments"
         document.warnings[text] += 1
 
 
 def _lamp(light: ET.Element) -> ET.Element:
-    """Return a small sphere as bright as a point or spot light."""
-    lamp = ET.Element("shape", type="sphere", id=light.get("id", f"{light.get('type')}_light"))
+    """Return a small area light as bright as a point or spot light."""
+    kind = light.get("type", "")
+    lamp = ET.Element("shape", type=_LAMPS[kind], id=light.get("id", f"{kind}_light"))
     lamp.extend(light.findall("transform"))
-    _set(lamp, "float", "radius", LAMP_RADIUS)
+    if kind == "point":
+        _set(lamp, "float", "radius", LAMP_RADIUS)
+    else:
+        _transform(lamp).insert(0, ET.Element("scale", value=str(LAMP_RADIUS)))
     position, intensity = _property(light, "position"), _property(light, "intensity")
     if position is not None:
         position.set("name", "center")

@@ -12,11 +12,9 @@ from nlt.scenes.description import SceneDescription
 
 @dataclass(frozen=True)
 class SceneState:
-    """The translation and presence of each of the M movable objects.
+    """The state of the M movable objects: `translation` (M, 3) float32 and `present` (M,) bool.
 
-    Attributes:
-        translation: (M, 3) float32, metres, relative to the position in the scene file; zero for a removed object.
-        present: (M,) bool.
+    Translations are in metres, from the position in the scene file; that of a removed object is zero.
     """
 
     translation: np.ndarray
