@@ -131,7 +131,6 @@ class Scene:
             quad = light_quad(self.description)
             self.shapes[MOVING_LIGHT] = Shape(MOVING_LIGHT, *quad, None, rectangle.bsdf(), rectangle.emitter())
         self._parameters = mi.traverse(self.mi_scene)
-        self._instances = {m.name: f"instance_{m.name}.to_world" for m in self.movables if m.name in groups}
         self._moving_meshes = {
             m.name: {
                 key: np.array(self._parameters[key]).reshape(-1, 3)
@@ -143,10 +142,9 @@ class Scene:
             }
             for m in self.movables
         }
-        moved = {*self._instances.values(), *(k for v in self._moving_meshes.values() for k in v)}
-        if not self._own_lights:
-            moved.add(f"emitter_{MOVING_LIGHT}.to_world")
-        self._parameters.keep(sorted(moved))
+        moved = {f"emitter_{MOVING_LIGHT}.to_world", *(f"instance_{m.name}.to_world" for m in self.movables)}
+        moved.update(*self._moving_meshes.values())
+        self._parameters.keep(sorted(moved & set(self._parameters.keys())))
 
     def _light_transform(self, translation: np.ndarray, scale: float = 1.0) -> Any:
         light, units = self.description.light, self.description.units_per_metre
@@ -167,9 +165,9 @@ class Scene:
             if movable.name == MOVING_LIGHT:
                 transform = self._light_transform(translation.astype(float), scale)
                 self._parameters[f"emitter_{MOVING_LIGHT}.to_world"] = transform
-            if movable.name in self._instances:
+            if (key := f"instance_{movable.name}.to_world") in self._parameters:
                 to_world = mi.ScalarTransform4f().translate(list(centre * (1 - scale) + offset)).scale(scale)
-                self._parameters[self._instances[movable.name]] = to_world
+                self._parameters[key] = to_world
             for key, rest in self._moving_meshes[movable.name].items():
                 moved = (rest - centre) * scale + centre + offset
                 self._parameters[key] = owned(moved.astype(np.float32))

@@ -218,10 +218,9 @@ def _value(element: ET.Element) -> None:
 
 def _texture(element: ET.Element) -> None:
     """Replace options of images that Mitsuba 3 refuses or ignores."""
-    filtering = _property(element, "filter_type")
+    filtering, gamma = _property(element, "filter_type"), _property(element, "gamma")
     if filtering is not None and filtering.get("value") not in ("nearest", "bilinear"):
         element.remove(filtering)  # trilinear, ewa: Mitsuba 3 has no mipmaps
-    gamma = _property(element, "gamma")
     if gamma is not None and float(gamma.get("value", 0)) == 1:
         element.remove(gamma)
         _set(element, "boolean", "raw", "true")
