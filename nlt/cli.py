@@ -156,7 +156,7 @@ def _render(options: argparse.Namespace) -> None:
 
 def _scenes(options: argparse.Namespace) -> None:
     if options.action == "list":
-        from nlt.scenes.catalog import listing
+        from nlt.scenes.description import listing
 
         print(listing())
         return

@@ -130,6 +130,7 @@ class BDPT(mi.SamplingIntegrator):
         lane_splats = [splats[k] for k in range(self.stored)] if camera else []
         return radiance, hit, [(splat.pixel, splat.radiance) for splat in lane_splats]
 
+    @dr.syntax
     def _light_subpath(self, scene: Any, sampler: Any, camera: Any, active: Any) -> tuple:
         """Return the vertices after the one on an area light, their number and their splats."""
         index, inverse_pmf, _ = scene.sample_emitter(sampler.next_1d(active), active)
@@ -149,10 +150,6 @@ class BDPT(mi.SamplingIntegrator):
             inverse=local.z * inverse,
             terms=[mi.Float(1) for _ in range(self.stored)],  # s = 0
         )
-        return self._extend_light_subpath(scene, sampler, camera, step, active)
-
-    @dr.syntax
-    def _extend_light_subpath(self, scene: Any, sampler: Any, camera: Any, step: Any, active: Any) -> tuple:
         context = mi.BSDFContext(mi.TransportMode.Importance)
         vertices = dr.alloc_local(_Vertex, self.stored)
         splats = dr.alloc_local(_Splat, self.stored, _Splat(mi.UInt32(0), mi.Color3f(0)))

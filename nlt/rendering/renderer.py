@@ -44,16 +44,13 @@ class Renderer:
     def __init__(self, scene: Scene, integrator: str = "scene") -> None:
         self.scene = scene
         self.integrator_name = choose_integrator(scene.description.integrator, integrator)
+        is_path = self.integrator_name == "path"
         # Infinite depth with Russian roulette, because a maximum depth would bias the result.
-        self.integrator = mi.load_dict(
-            {"type": "path", "max_depth": -1} if self.integrator_name == "path" else {"type": "bdpt"}
-        )
+        self.integrator = mi.load_dict({"type": "path", "max_depth": -1} if is_path else {"type": "bdpt"})
         self.emitters = list(scene.mi_scene.emitters())
         self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
-        self._radiance = freeze(_radiance if self.integrator_name == "path" else _bidirectional)
-        self._gbuffer = freeze(_gbuffer)
-        self._emission = freeze(_emission)
-        self._transmits = freeze(_transmits)
+        self._radiance = freeze(_radiance if is_path else _bidirectional)
+        self._gbuffer, self._emission, self._transmits = freeze(_gbuffer), freeze(_emission), freeze(_transmits)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
         room = scene.description.room
@@ -72,15 +69,12 @@ class Renderer:
         Returns:
             (3, H, W) float32 for the whole image, else (3, n).
         """
-        if pixels is not None:
-            return self._trace(camera, spp, seed, pixels)
-        if not is_jit():
-            # A Python loop over paths takes longer than a whole image in C++, unless few pixels are requested.
-            return self._scalar_image(camera, spp, seed)
-        image = self._trace(camera, spp, seed, np.arange(camera.width * camera.height))
-        return image.reshape(3, camera.height, camera.width)
-
-    def _trace(self, camera: Camera, spp: int, seed: int, pixels: np.ndarray) -> np.ndarray:
+        shape = (3, camera.height, camera.width) if pixels is None else (3, -1)
+        if pixels is None:
+            if not is_jit():
+                # A Python loop over paths takes longer than a whole image in C++, unless few pixels are requested.
+                return self._scalar_image(camera, spp, seed)
+            pixels = np.arange(camera.width * camera.height)
         corner = np.stack([pixels % camera.width, pixels // camera.width], 1).astype(np.float32)
         total = np.zeros((len(pixels), 3))
         batch = max(1, min(spp, _MAX_LANES // max(len(pixels), 1)))
@@ -100,8 +94,10 @@ class Renderer:
             # Samples of a pixel are contiguous. Summing them here is deterministic; an atomic add is not.
             total += values.reshape(len(pixels), count, 3).sum(1, dtype=np.float64)
             for pixel, value in zip(splats[::2], splats[1::2], strict=True):
-                total += _splatted(pixel, value, camera.width * camera.height)[pixels] / len(pixels)
-        return (total / spp).T.astype(np.float32)
+                lit = value.any(1)
+                image = [np.bincount(pixel[lit], channel, camera.width * camera.height) for channel in value[lit].T]
+                total += np.stack(image, 1)[pixels] / len(pixels)
+        return (total / spp).T.astype(np.float32).reshape(shape)
 
     def _scalar_image(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
         sensor = mi.load_dict({
@@ -148,10 +144,10 @@ class Renderer:
         if len(pixels):
             lanes = {"corner": ("Point2f", np.floor(centres[pixels]))}
             (emission[pixels],) = launch(self._emission, lanes, **fixed)
-        image = lambda a: a.T.reshape(-1, camera.height, camera.width)
-        buffers = {"depth": depth[:, None].astype(np.float32), "normal": normal, "albedo": albedo}
-        surfaces = {name: image(np.where(valid[:, None], a, 0)) for name, a in buffers.items()}
-        return {**surfaces, "emission": image(emission)}
+        mask = valid[:, None]
+        buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(mask, normal, 0)}
+        buffers |= {"albedo": np.where(mask, albedo, 0), "emission": emission}
+        return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
     def _may_see_light(self, camera: Camera, escapes: np.ndarray) -> np.ndarray:
         """Return (H W,) bool: the pixels that may have emission. The others need no rays for it.
@@ -193,8 +189,18 @@ class Renderer:
             sum of the flux is the arriving power. Photons that did not arrive within the limit are zero and not valid.
         """
         rng = np.random.default_rng(seed)
-        arriving, reach = self._estimate_arrivals()
-        share = arriving / arriving.sum()
+        lit = self.scene.lit
+        if lit.key not in self._pilots:
+            # Estimate, per emitter, the arriving power (mean over RGB, scene units) and the share of casts that arrive.
+            uniform = np.random.default_rng(0).random((_PILOT, 5), np.float32)
+            with self.scene.in_state(lit):
+                casts = [self._cast(k, uniform) for k in range(len(self.emitters))]
+            powers = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
+            # Assume at least one arrival, so that an emitter that seems to light nothing still gets a few photons.
+            shares = [max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts]
+            self._pilots[lit.key] = np.array(powers), np.array(shares)
+        power, reach = self._pilots[lit.key]
+        share = power / power.sum()
         # Systematic resampling: each emitter gets its share of the photons, rounded at random.
         edges = np.floor(np.concatenate([[0], np.cumsum(share)]) * count + rng.random())
         edges[-1] = edges[0] + count
@@ -212,19 +218,6 @@ class Renderer:
             "photon_hit": hit / units,
             "photon_valid": valid,
         }
-
-    def _estimate_arrivals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Estimate, per emitter, the arriving power (mean over RGB, scene units) and the share of casts that arrive."""
-        lit = self.scene.lit
-        if lit.key not in self._pilots:
-            uniform = np.random.default_rng(0).random((_PILOT, 5), np.float32)
-            with self.scene.in_state(lit):
-                casts = [self._cast(k, uniform) for k in range(len(self.emitters))]
-            # Assume at least one arrival, so that an emitter that seems to light nothing still gets a few photons.
-            reach = np.array([max(arrived.mean(), 1 / _PILOT) for *_, arrived in casts])
-            power = [max(flux[arrived].sum(), flux.mean()) / (3 * _PILOT) for _, _, flux, _, arrived in casts]
-            self._pilots[lit.key] = np.array(power), reach
-        return self._pilots[lit.key]
 
     def _sample_arrivals(self, emitter: int, number: int, reach: float, rng: np.random.Generator) -> list[np.ndarray]:
         """Return origin, direction, flux, hit (number, 3) and valid (number,) of arriving photons of one emitter."""
@@ -248,11 +241,8 @@ class Renderer:
 
     def _cast(self, emitter: int, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
         """Cast photons of an emitter: origin, direction, flux, hit (n, 3) in scene units; whether they arrive (n,)."""
-        lanes = {
-            "u0": ("Float", uniform[:, 0]),
-            "u1": ("Point2f", uniform[:, 1:3]),
-            "u2": ("Point2f", uniform[:, 3:5]),
-        }
+        u0, u1, u2 = uniform[:, 0], uniform[:, 1:3], uniform[:, 3:]
+        lanes = {"u0": ("Float", u0), "u1": ("Point2f", u1), "u2": ("Point2f", u2)}
         fixed = {"scene": self.scene.mi_scene, "masks": self.scene.masks, **self._room}
         return launch(self._photons[emitter], lanes, emitter=self.emitters[emitter], **fixed)
 
@@ -282,12 +272,6 @@ def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image
     pinhole = Pinhole(**camera, width=image.x, height=image.y, pixels=image.z)
     value, _, splats = integrator.trace(scene, sampler, ray, pinhole)
     return (value, *(part for splat in splats for part in splat))
-
-
-def _splatted(pixel: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
-    """Sum `value` (n, 3) by `pixel` (n,) to (count, 3) float64, in the order of the lanes."""
-    lit = value.any(1)
-    return np.stack([np.bincount(pixel[lit], channel, count) for channel in value[lit].T], 1)
 
 
 def _gbuffer(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
@@ -338,14 +322,13 @@ def choose_integrator(own: str, wanted: str = "scene") -> str:
     Raises:
         UserError: `wanted` is "bdpt" and the active variant cannot run it.
     """
-    integrator = own if wanted == "scene" else wanted
-    if integrator == "path":
-        return integrator
+    if (own if wanted == "scene" else wanted) == "path":
+        return "path"
     if is_jit():
         # Imported here because its classes belong to the active variant.
         import nlt.rendering.bdpt  # noqa: F401
 
-        return integrator
+        return "bdpt"
     if wanted != "scene":
         raise UserError("integrator: bdpt needs Mitsuba's llvm or cuda variant; install LLVM, or use integrator: path")
     log.warning("integrator: bdpt needs Mitsuba's llvm or cuda variant; using path, which has the same expectation")

@@ -10,7 +10,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -28,8 +28,7 @@ _LIBRARIES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Variant:
+class Variant(NamedTuple):
     """The chosen variant, with the reason in one line."""
 
     name: str
@@ -61,21 +60,17 @@ def choose_variant() -> Variant:
         if name.startswith("llvm") and (library := next(iter(_llvm_libraries()), None)):
             os.environ[_LIBRARY] = library
         return Variant(name, "set by NLT_VARIANT")
-    variant = _first_that_works()
-    os.environ["NLT_VARIANT"] = variant.name  # worker processes inherit this choice and do not probe again
-    return variant
-
-
-def _first_that_works() -> Variant:
     failed: list[str] = []
     for name in VARIANTS[:-1]:
         for library in _llvm_libraries() if name.startswith("llvm") else [None]:
             if _works(name, library):
+                os.environ["NLT_VARIANT"] = name  # worker processes inherit this choice and do not probe again
                 if library:
                     os.environ[_LIBRARY] = library
-                reason = f"works{f' with {library}' if library else ''}; {', '.join(failed) or 'first choice'}"
-                return Variant(name, reason)
+                works = f"works with {library}" if library else "works"
+                return Variant(name, f"{works}; {', '.join(failed) or 'first choice'}")
         failed.append(f"{name} does not work here")
+    os.environ["NLT_VARIANT"] = VARIANTS[-1]
     return Variant(VARIANTS[-1], "; ".join(failed))
 
 
@@ -95,7 +90,6 @@ def _works(variant: str, library: str | None) -> bool:
     environment = dict(os.environ, **({_LIBRARY: library} if library else {}))
     probe = [sys.executable, "-c", _PROBE.format(variant)]
     try:
-        result = subprocess.run(probe, env=environment, capture_output=True, timeout=60, check=False)
+        return subprocess.run(probe, env=environment, capture_output=True, timeout=60, check=False).returncode == 0
     except subprocess.TimeoutExpired:
         return False
-    return result.returncode == 0

@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from nlt.errors import UserError
-from nlt.scenes import importer
-from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, Movable, SceneDescription
+from nlt.scenes.description import BUILTIN, MOVING_LIGHT, STATIC, SceneDescription
+from nlt.scenes.importer import read
 from nlt.scenes.lanes import is_jit, owned
 from nlt.scenes.masks import is_mask
 from nlt.scenes.meshes import live_mesh
@@ -41,10 +41,15 @@ class Shape:
     emitter: Any | None
 
     @property
+    def face_normals(self) -> np.ndarray:
+        """The normal (F, 3) of each face, as long as the face's area in m²."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.cross(b - a, c - a) / 2
+
+    @property
     def face_areas(self) -> np.ndarray:
         """The area (F,) of each face in m²."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return np.linalg.norm(self.face_normals, axis=1)
 
 
 class Scene:
@@ -62,10 +67,18 @@ class Scene:
     def __init__(self, description: SceneDescription, experiment: str) -> None:
         self.description, self.experiment = description, experiment
         self.movables = description.movables(experiment)
-        own_lights = experiment != "moving_lights"
+        self._own_lights = own_lights = experiment != "moving_lights"
         source = load_source(description)
         meshes = {shape.id(): shape for shape in source.shapes()}
-        self._check_shapes(set(meshes))
+        claimed: dict[str, str] = {}
+        for movable in description.objects:
+            for shape in movable.shapes:
+                where = f"{description.file}: objects.{movable.name}.shapes"
+                if shape not in meshes:
+                    raise UserError(f"{where}: the scene has no shape {shape!r}; its shapes are {some(sorted(meshes))}")
+                if shape in claimed:
+                    raise UserError(f"{where}: shape {shape!r} already belongs to {claimed[shape]}")
+                claimed[shape] = movable.name
         self.environment = source.environment() if own_lights else None
         if own_lights and not source.emitters():
             raise UserError(
@@ -78,19 +91,9 @@ class Scene:
             meshes = {name: dark(name, mesh) if mesh.is_emitter() else mesh for name, mesh in meshes.items()}
         self._assemble(meshes)
         self.masks = any(is_mask(shape.bsdf) for shape in self.shapes.values())
-        self._centres = {m.name: self._centre(m) for m in self.movables}
+        vertices = {m.name: np.concatenate([self.shapes[name].vertices for name in m.shapes]) for m in self.movables}
+        self._centres = {name: (v.min(0) + v.max(0)) / 2 for name, v in vertices.items()}
         self.set_state(rest_state(description, experiment))
-
-    def _check_shapes(self, known: set[str]) -> None:
-        claimed: dict[str, str] = {}
-        for movable in self.description.objects:
-            for shape in movable.shapes:
-                where = f"{self.description.file}: objects.{movable.name}.shapes"
-                if shape not in known:
-                    raise UserError(f"{where}: the scene has no shape {shape!r}; its shapes are {some(sorted(known))}")
-                if shape in claimed:
-                    raise UserError(f"{where}: shape {shape!r} already belongs to {claimed[shape]}")
-                claimed[shape] = movable.name
 
     def _assemble(self, meshes: dict[str, Any]) -> None:
         """Create one instance per movable object and one for the rest; emitters and the environment stay separate."""
@@ -112,12 +115,22 @@ class Scene:
         if self.environment is not None:
             parts["environment"] = self.environment
         if not self._own_lights:
-            parts[f"emitter_{MOVING_LIGHT}"] = self._moving_light()
+            light = self.description.light
+            assert light is not None  # otherwise movables() raises
+            parts[f"emitter_{MOVING_LIGHT}"] = {
+                "type": "rectangle",
+                "to_world": self._light_transform(np.zeros(3)),
+                "black": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+                "light": {"type": "area", "radiance": {"type": "rgb", "value": light.radiance.tolist()}},
+            }
         self.mi_scene = mi.load_dict(parts)
         if not self._own_lights:
-            self.shapes[MOVING_LIGHT] = self._light_shape()
+            # Points are sampled on the light too. Its shape has the BSDF and the emitter of the rectangle, because
+            # additional ones would join every virtual call of a compiled kernel.
+            (rectangle,) = [shape for shape in self.mi_scene.shapes() if shape.id() == f"emitter_{MOVING_LIGHT}"]
+            quad = light_quad(self.description)
+            self.shapes[MOVING_LIGHT] = Shape(MOVING_LIGHT, *quad, None, rectangle.bsdf(), rectangle.emitter())
         self._parameters = mi.traverse(self.mi_scene)
-        self._instances = {m.name: f"instance_{m.name}.to_world" for m in self.movables if m.name in groups}
         self._moving_meshes = {
             m.name: {
                 key: np.array(self._parameters[key]).reshape(-1, 3)
@@ -129,31 +142,9 @@ class Scene:
             }
             for m in self.movables
         }
-        moved = {*self._instances.values(), *(k for v in self._moving_meshes.values() for k in v)}
-        if not self._own_lights:
-            moved.add(f"emitter_{MOVING_LIGHT}.to_world")
-        self._parameters.keep(sorted(moved))
-
-    @property
-    def _own_lights(self) -> bool:
-        return self.experiment != "moving_lights"
-
-    def _moving_light(self) -> dict[str, Any]:
-        light = self.description.light
-        assert light is not None  # otherwise movables() raises
-        return {
-            "type": "rectangle",
-            "to_world": self._light_transform(np.zeros(3)),
-            "black": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-            "light": {"type": "area", "radiance": {"type": "rgb", "value": light.radiance.tolist()}},
-        }
-
-    def _light_shape(self) -> Shape:
-        """Return the quad of the moving light, so that points are sampled on it too."""
-        # Reuse the light's BSDF and emitter: additional ones would join every virtual call of a compiled kernel.
-        (rectangle,) = [s for s in self.mi_scene.shapes() if s.id() == f"emitter_{MOVING_LIGHT}"]
-        vertices, faces = light_quad(self.description)
-        return Shape(MOVING_LIGHT, vertices, faces, None, rectangle.bsdf(), rectangle.emitter())
+        moved = {f"emitter_{MOVING_LIGHT}.to_world", *(f"instance_{m.name}.to_world" for m in self.movables)}
+        moved.update(*self._moving_meshes.values())
+        self._parameters.keep(sorted(moved & set(self._parameters.keys())))
 
     def _light_transform(self, translation: np.ndarray, scale: float = 1.0) -> Any:
         light, units = self.description.light, self.description.units_per_metre
@@ -174,9 +165,9 @@ class Scene:
             if movable.name == MOVING_LIGHT:
                 transform = self._light_transform(translation.astype(float), scale)
                 self._parameters[f"emitter_{MOVING_LIGHT}.to_world"] = transform
-            if movable.name in self._instances:
+            if (key := f"instance_{movable.name}.to_world") in self._parameters:
                 to_world = mi.ScalarTransform4f().translate(list(centre * (1 - scale) + offset)).scale(scale)
-                self._parameters[self._instances[movable.name]] = to_world
+                self._parameters[key] = to_world
             for key, rest in self._moving_meshes[movable.name].items():
                 moved = (rest - centre) * scale + centre + offset
                 self._parameters[key] = owned(moved.astype(np.float32))
@@ -201,10 +192,6 @@ class Scene:
         """The state at rest without the removed emitters; the powers of all emitters depend on nothing else."""
         emits = np.array([bool(self._moving_meshes[movable.name]) for movable in self.movables], bool)
         return SceneState(np.zeros_like(self.state.translation), self.state.present | ~emits)
-
-    def _centre(self, movable: Movable) -> np.ndarray:
-        vertices = np.concatenate([self.shapes[name].vertices for name in movable.shapes])
-        return (vertices.min(0) + vertices.max(0)) / 2
 
 
 def light_quad(description: SceneDescription) -> tuple[np.ndarray, np.ndarray]:
@@ -237,7 +224,7 @@ def load_source(description: SceneDescription) -> Any:
             known = ", ".join(builtin.BUILTINS)
             raise UserError(f"{description.file}: source: no built-in scene {name!r}; known are {known}")
         return builtin.mitsuba_scene(name)
-    return importer.load(description.path)
+    return read(description.path).scene
 
 
 def read_shape(mesh: Any, units_per_metre: float = 1.0, own_lights: bool = True) -> Shape:

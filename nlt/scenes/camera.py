@@ -9,11 +9,9 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera. Conventions are those of `nlt.data.sample`: x right, y down, z forward, in metres.
+    """A pinhole camera: intrinsics `matrix` K (3, 3), from view space to pixels, and rigid `world_to_view` T (4, 4).
 
-    Attributes:
-        matrix: (3, 3) intrinsics K, from view space to pixels.
-        world_to_view: (4, 4) rigid transform T.
+    Conventions are those of `nlt.data.sample`: x right, y down, z forward, in metres.
     """
 
     matrix: np.ndarray

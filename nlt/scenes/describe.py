@@ -48,12 +48,11 @@ def check(path: Path) -> str:
     Raises:
         UserError: the file cannot be loaded, see `importer.read`.
     """
-    imported, shapes, proposal = _propose(path)
-    environment = imported.scene.environment() is not None
+    imported, shapes, proposal, warnings = _propose(path)
     because = proposal.because
     lines = [
         str(path),
-        *_contents(list(shapes.values()), environment),
+        *_contents(list(shapes.values()), imported.scene.environment() is not None),
         f"bounding box: {_span(proposal.bounds)}",
         f"up: +{proposal.up} ({because['up']})",
         f"units per metre: {proposal.units_per_metre:g} ({because['units_per_metre']})",
@@ -66,7 +65,7 @@ def check(path: Path) -> str:
     if imported.camera is not None:
         eye, forward = imported.camera[:3, 3], imported.camera[:3, 2]
         lines.append(f"the file's own camera: at {_numbers(eye)}, looking along {_numbers(forward)}")
-    return "\n".join(lines + [f"warning: {w}" for w in _warnings(imported, proposal)])
+    return "\n".join(lines + [f"warning: {warning}" for warning in warnings])
 
 
 def add(path: Path, name: str | None = None, output: Path | None = None) -> Path:
@@ -80,30 +79,26 @@ def add(path: Path, name: str | None = None, output: Path | None = None) -> Path
     for taken in (file, find_config("scenes", name)) if output is None else (file,):
         if taken.exists():
             raise UserError(f"{taken}: already exists; choose another name with --name, or another file with -o")
-    imported, _, proposal = _propose(path)
+    *_, proposal, warnings = _propose(path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(_yaml(path, name, imported, proposal))
+    file.write_text(_yaml(path, name, proposal, warnings))
     return file
 
 
-def _propose(path: Path) -> tuple[Imported, dict[str, Shape], Proposal]:
+def _propose(path: Path) -> tuple[Imported, dict[str, Shape], Proposal, list[str]]:
+    """Load a scene file; return it, its shapes, a proposed description and warnings."""
     imported = read(path)
     shapes = {mesh.id(): read_shape(mesh) for mesh in imported.scene.shapes()}
     for shape in shapes.values():
         if not np.isfinite(shape.vertices).all():
             raise UserError(f"{path}: shape {shape.id}: a vertex is not finite; repair the mesh")
-    return imported, shapes, propose(imported.scene, shapes, imported.up)
-
-
-def _warnings(imported: Imported, proposal: Proposal) -> list[str]:
-    messages = list(imported.warnings)
+    proposal, warnings = propose(imported.scene, shapes, imported.up), list(imported.warnings)
     if not imported.scene.emitters():
-        messages.append("nothing emits light: only moving_lights will work")
-    if np.abs(proposal.bounds).max() > _FAR:
-        messages.append(
-            f"coordinates reach {np.abs(proposal.bounds).max():.3g}, too far for float32: move or scale the scene"
-        )
-    return messages
+        warnings.append("nothing emits light: only moving_lights will work")
+    farthest = np.abs(proposal.bounds).max()
+    if farthest > _FAR:
+        warnings.append(f"coordinates reach {farthest:.3g}, too far for float32: move or scale the scene")
+    return imported, shapes, proposal, warnings
 
 
 def _contents(shapes: Sequence[Shape], environment: bool) -> list[str]:
@@ -130,18 +125,18 @@ def _numbers(values: Any) -> str:
     return "[" + ", ".join(f"{v + 0:.4g}" for v in np.where(np.abs(values) < 1e-6, 0, values)) + "]"
 
 
-def _yaml(path: Path, name: str, imported: Imported, proposal: Proposal) -> str:
+def _yaml(path: Path, name: str, proposal: Proposal, warnings: list[str]) -> str:
     root, source = scenes_root().resolve(), path.resolve()
     because, light = proposal.because, proposal.light
     pair = lambda box: f"[{_numbers(box[0])}, {_numbers(box[1])}]"
-    warnings = "".join(f"# {w}\n" for w in _warnings(imported, proposal))
+    comments = "".join(f"# {warning}\n" for warning in warnings)
     objects = "".join(
         f"  {_word(o.name)}: {{shapes: [{', '.join(map(_word, o.shapes))}], box: {pair(o.box)}}}\n"
         for o in proposal.objects
     )
     return f"""# Written by `nlt scenes add`. All values are guesses: check and edit them. Lengths are in scene units.
 # Preview: nlt scenes preview {name} -o {name}.png
-{warnings}name: {_word(name)}
+{comments}name: {_word(name)}
 source: {_word(str(source.relative_to(root) if source.is_relative_to(root) else source))}
 units_per_metre: {proposal.units_per_metre:g}  # {because["units_per_metre"]}
 up: {proposal.up}  # {because["up"]}

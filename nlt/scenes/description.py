@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat, field_validator, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, field_validator
 
 from nlt.config import Settings, parse, read_configs
 from nlt.errors import UserError
@@ -142,10 +142,8 @@ class _Corners(Settings):
     min: Point
     max: Point
 
-    @model_validator(mode="after")
-    def _check(self) -> _Corners:
-        _check_box((self.min, self.max))
-        return self
+
+_CornerBox = Annotated[_Corners, AfterValidator(lambda corners: _check_box((corners.min, corners.max)))]
 
 
 class _Object(Settings):
@@ -173,8 +171,8 @@ class _File(Settings):
     up: Literal["x", "y", "z"] = "y"
     exposure: Positive = 1.0
     fov: FieldOfView = 70.0
-    camera: _Corners
-    look_at: _Corners | None = None
+    camera: _CornerBox
+    look_at: _CornerBox | None = None
     room: _Box | None = None
     integrator: Integrator = "path"
     objects: dict[str, _Object] = Field(default={})
@@ -201,8 +199,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
     content = {key: value for key, value in read_configs([file]).items() if value is not None}
     read = parse(_File, content, file)
     metres = lambda lengths: np.array(lengths, float) * (1 / read.units_per_metre)
-    corners = lambda box: metres([box.min, box.max])
-    camera, light = corners(read.camera), None
+    camera, light = metres(read.camera), None
     half = camera.mean(0) + (camera - camera.mean(0)) / 2
     if (lamp := read.moving_light) is not None:
         light = MovingLight(metres(lamp.size), np.array(lamp.radiance), metres(lamp.box))
@@ -215,7 +212,7 @@ def load_description(name: str, need_source: bool = True) -> SceneDescription:
         exposure=read.exposure,
         fov=read.fov,
         camera=camera,
-        look_at=half if read.look_at is None else corners(read.look_at),
+        look_at=half if read.look_at is None else metres(read.look_at),
         objects=tuple(Movable(key, entry.shapes, metres(entry.box)) for key, entry in read.objects.items()),
         light=light,
         room=None if read.room is None else metres(read.room),
@@ -236,3 +233,20 @@ def _find_source(file: Path, source: str, needed: bool) -> str:
     raise UserError(
         f"{file}: source: no scene file at {' or '.join(map(str, candidates))}; set NLT_SCENES to the scenes' folder"
     )
+
+
+def listing() -> str:
+    """Return a table with one line per description; the line of a broken description holds its error."""
+    rows = [("scene", "source", "objects", "moving light", "integrator")]
+    broken = []
+    for name in config_names("scenes"):
+        try:
+            scene = load_description(name, need_source=False)
+        except UserError as error:
+            broken.append(f"{name}  broken: {error}")
+            continue
+        location = "built in" if scene.path is None else "here" if scene.path.is_file() else "not here"
+        rows.append((name, location, str(len(scene.objects)), "yes" if scene.light else "no", scene.integrator))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines + broken)

@@ -17,9 +17,9 @@ import numpy as np
 
 from nlt.errors import UserError
 from nlt.scenes import mitsuba_xml
-from nlt.scenes.meshes import bsdf, curved, emitter, live_mesh
+from nlt.scenes.meshes import bsdf, curved, live_mesh, texture
 from nlt.scenes.mitsuba_xml import LAMP_RADIUS, unique
-from nlt.scenes.model import Material, Model, named_files, read_gltf, read_obj
+from nlt.scenes.model import Material, named_files, read_gltf, read_obj
 
 SUFFIXES = (".xml", ".gltf", ".glb", ".obj")
 
@@ -34,13 +34,8 @@ class Imported:
     up: str | None = None
 
 
-def load(path: Path) -> Any:
-    """Return the file as a `mi.Scene` of meshes. The same file always gives the same scene."""
-    return read(path).scene
-
-
 def read(path: Path) -> Imported:
-    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the active variant.
+    """Load a Mitsuba XML (0.5 to 3.x), glTF, GLB or OBJ file in the active variant, always as the same scene.
 
     Raises:
         UserError: the file has another format, it refers to missing files (all are listed), or Mitsuba refuses it.
@@ -51,51 +46,49 @@ def read(path: Path) -> Imported:
         raise UserError(f"{path}: {problem}; give a file ending in {', '.join(SUFFIXES)}")
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: {suffix or 'no suffix'}: nlt reads scene files ending in {', '.join(SUFFIXES)}")
-    imported = _read_xml(path) if suffix == ".xml" else _read_model(path)
-    if not imported.scene.shapes():
-        raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in imported.warnings)}")
-    return imported
+    camera = up = None
+    if suffix == ".xml":
+        scene, counts, camera = _read_xml(path)
+        if camera is not None:
+            axis = int(np.abs(camera[:3, 1]).argmax())
+            up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
+    else:
+        scene, counts = _read_model(path)
+        up = None if suffix == ".obj" else "y"
+    warnings = tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(counts.items()))
+    if not scene.shapes():
+        raise UserError(f"{path}: no shapes to render{''.join(f'; {w}' for w in warnings)}")
+    return Imported(scene, warnings, camera, up)
 
 
-def check_missing(path: Path, missing: list[str]) -> None:
-    """Raise one UserError that lists all missing files, if any."""
+def _check_missing(path: Path, missing: list[str]) -> None:
     if missing:
         raise UserError(f"{path}: missing: {', '.join(sorted(missing))}; add them, paths are relative to {path.parent}")
 
 
-def _read_xml(path: Path) -> Imported:
+def _read_xml(path: Path) -> tuple[Any, Counter[str], np.ndarray | None]:
+    """Return the scene, counts of warnings and the pose (4, 4) of the file's camera, if it has one."""
     document = mitsuba_xml.read(path)
-    check_missing(path, document.missing)
+    _check_missing(path, document.missing)
     pose = None if document.sensor is None else document.sensor.find("transform")
     with tempfile.TemporaryDirectory() as folder, _reporting(path, document.warnings):
         for shape in document.root.findall("shape"):
             if shape.get("type") in mitsuba_xml.ANALYTIC:
                 _to_mesh_file(shape, Path(folder))
         scene = _instantiate(document.root)
-        camera = None if pose is None else _pose(pose)
-    up = None
-    if camera is not None:
-        axis = int(np.abs(camera[:3, 1]).argmax())
-        up = "xyz"[axis] if camera[axis, 1] > 0.7 else None
-    return Imported(scene, _format_warnings(document.warnings), camera, up)
+        return scene, document.warnings, None if pose is None else _probe("disk", [pose])[1]
 
 
-def _read_model(path: Path) -> Imported:
-    check_missing(path, [name for name in named_files(path) if not (path.parent / name).is_file()])
-    is_obj = path.suffix.lower() == ".obj"
-    model = read_obj(path) if is_obj else read_gltf(path)
-    scene = _build(model)
-    return Imported(scene, _format_warnings(model.warnings), up=None if is_obj else "y")
-
-
-def _build(model: Model) -> Any:
-    """Build a scene of a model's parts, under their names, with a small sphere for every lamp."""
+def _read_model(path: Path) -> tuple[Any, Counter[str]]:
+    """Return the scene, with a small sphere for every lamp, and counts of warnings."""
+    _check_missing(path, [name for name in named_files(path) if not (path.parent / name).is_file()])
+    model = read_obj(path) if path.suffix.lower() == ".obj" else read_gltf(path)
     parts = list(model.parts)
     for name, position, intensity in model.lamps:
         placed = np.diag([LAMP_RADIUS, LAMP_RADIUS, LAMP_RADIUS, 1])
         placed[:3, 3] = position
-        radiance = tuple(intensity / (np.pi * LAMP_RADIUS**2))
-        parts.append((name, curved("sphere").moved(placed), Material(colour=(0.0, 0.0, 0.0), emission=radiance)))
+        glow = Material(colour=(0.0, 0.0, 0.0), emission=tuple(intensity / (np.pi * LAMP_RADIUS**2)))
+        parts.append((name, curved("sphere").moved(placed), glow))
     bsdfs: dict[int, Any] = {}  # one per material, because each instance costs tracing time
     meshes: dict[str, Any] = {}
     for name, triangles, material in parts:
@@ -104,14 +97,12 @@ def _build(model: Model) -> Any:
         key = unique(re.sub(r"\W", "_", name), meshes)
         if id(material) not in bsdfs:
             bsdfs[id(material)] = mi.load_dict(bsdf(material))
-        light = emitter(material)
-        live = None if light is None else mi.load_dict(light)
-        meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], live)
-    return mi.load_dict({"type": "scene", **meshes})
-
-
-def _format_warnings(warnings: Counter[str]) -> tuple[str, ...]:
-    return tuple(f"{text} ({n} times)" if n > 1 else text for text, n in sorted(warnings.items()))
+        light = None
+        if any(material.emission):
+            radiance = texture(material.emission, material.emission_image)
+            light = mi.load_dict({"type": "area", "radiance": radiance})
+        meshes[key] = live_mesh(key, triangles, bsdfs[id(material)], light)
+    return mi.load_dict({"type": "scene", **meshes}), model.warnings
 
 
 class _WarningCounter(mi.Appender):
@@ -152,40 +143,34 @@ def _reporting(path: Path, warnings: Counter[str]) -> Iterator[None]:
             logger.add_appender(appender)
 
 
-def _parse(root: ET.Element) -> tuple[Any, Any]:
-    """Return the configuration and the result of Mitsuba's parser. Shapes are not merged and keep their ids."""
+def _instantiate(root: ET.Element) -> Any:
+    """Instantiate a scene with Mitsuba's parser, which upgrades old names. Shapes are not merged and keep their ids."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     config.merge_equivalent = config.merge_meshes = False
     config.unused_properties = mi.LogLevel.Warn
-    return config, mi.parser.parse_string(config, ET.tostring(root, encoding="unicode"))
-
-
-def _instantiate(root: ET.Element) -> Any:
-    """Instantiate a scene with Mitsuba's parser, which upgrades old names."""
-    config, state = _parse(root)
+    state = mi.parser.parse_string(config, ET.tostring(root, encoding="unicode"))
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)
 
 
-def _pose(transform: ET.Element) -> np.ndarray:
-    """Return the matrix (4, 4) of a `<transform>`, as Mitsuba reads it."""
+def _probe(kind: str, place: list[ET.Element]) -> tuple[Any, np.ndarray | None]:
+    """Return an analytic shape at its transform, centre, radius or ends, and its matrix (4, 4) unless it is a mesh."""
     root = ET.Element("scene", version=mitsuba_xml.OLD)
-    ET.SubElement(root, "sensor", type="perspective").append(transform)
-    _, state = _parse(root)
-    return np.array(state.nodes[1].props[transform.get("name", "")].matrix, float).reshape(4, 4)
+    ET.SubElement(root, "shape", type=kind).extend(place)
+    (shape,) = _instantiate(root).shapes()
+    if isinstance(shape, mi.Mesh):  # a rectangle or a cube
+        return shape, None
+    return shape, np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
 
 
 def _to_mesh_file(shape: ET.Element, folder: Path) -> None:
-    """Replace an analytic shape by a mesh file; Mitsuba derives the placement from its centre, radius and ends."""
+    """Replace an analytic shape by a mesh file."""
     kind, file = shape.get("type", ""), str(folder / f"{shape.get('id')}.ply")
-    place = [c for c in shape if c.tag in ("transform", "point", "float")]
-    root = ET.Element("scene", version=mitsuba_xml.OLD)
-    ET.SubElement(root, "shape", type=kind).extend(place)
-    (probe,) = _instantiate(root).shapes()
-    if isinstance(probe, mi.Mesh):  # a rectangle or a cube, whose vertices are not among the scene's parameters
-        probe.write_ply(file)
+    place = [child for child in shape if child.tag in ("transform", "point", "float")]
+    exact, matrix = _probe(kind, place)
+    if matrix is None:
+        exact.write_ply(file)
     else:
-        matrix = np.array(mi.traverse(probe)["to_world"].matrix, float).reshape(4, 4)
         live_mesh(kind, curved(kind).moved(matrix)).write_ply(file)
     for child in place:
         shape.remove(child)

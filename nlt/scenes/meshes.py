@@ -64,7 +64,7 @@ def curved(kind: str) -> Triangles:
 
 def bsdf(material: Material) -> dict[str, Any]:
     """Return the nearest Mitsuba BSDF: diffuse, plastic, conductor or glass if one of these fits, else `principled`."""
-    colour = _texture(material.colour, material.image)
+    colour = texture(material.colour, material.image)
     prefix, alpha = "rough", {"alpha": max(material.roughness**2, 1e-3)}
     if material.roughness < 0.05 or (material.transmission > 0.5 and material.thin):
         prefix, alpha = "", {}
@@ -93,22 +93,15 @@ def bsdf(material: Material) -> dict[str, Any]:
     return inner
 
 
-def emitter(material: Material) -> dict[str, Any] | None:
-    """Return the material's area light, or None if it does not emit."""
-    if not any(material.emission):
-        return None
-    return {"type": "area", "radiance": _texture(material.emission, material.emission_image)}
-
-
-def _texture(colour: tuple[float, ...], image: Image.Image | None) -> dict[str, Any]:
+def texture(colour: tuple[float, ...], image: Image.Image | None) -> dict[str, Any]:
     """Return a linear colour, multiplied by an sRGB image if there is one."""
     if image is None:
         return {"type": "rgb", "value": list(colour)}
     pixels = np.asarray(image.convert("RGB"))
     if all(c == 1 for c in colour):
         return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.copy())}
-    table = linear(np.arange(256) / 255)
-    return _raw((table[pixels] * colour).astype(np.float32))
+    values = (linear(np.arange(256) / 255)[pixels] * colour).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
 
 
 def _channel(factor: float, image: Image.Image | None, band: int, cutoff: float | None = None) -> Any:
@@ -117,8 +110,5 @@ def _channel(factor: float, image: Image.Image | None, band: int, cutoff: float 
         return factor if cutoff is None else float(factor >= cutoff)
     bands = np.asarray(image.convert("L") if len(image.getbands()) == 1 else image.convert("RGB"), np.float32) / 255
     values = factor * (bands if bands.ndim == 2 else bands[..., band])
-    return _raw((values if cutoff is None else values >= cutoff).astype(np.float32)[..., None])
-
-
-def _raw(values: np.ndarray) -> dict[str, Any]:
-    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
+    rounded = values if cutoff is None else values >= cutoff
+    return {"type": "bitmap", "bitmap": mi.Bitmap(rounded.astype(np.float32)[..., None]), "raw": True}

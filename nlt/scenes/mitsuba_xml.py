@@ -60,9 +60,7 @@ def read(path: Path) -> Document:
     _drop_unused(root)
     for element in root.iter("texture"):
         _texture(element)
-    for element in root.findall("emitter"):
-        _emitter(document, element)
-    _one_environment(document, root)
+    _convert_lights(document, root)
     _name_shapes(root)
     _locate(document, root, folders)
     root.set("version", OLD)
@@ -120,20 +118,15 @@ def _property(element: ET.Element, name: str) -> ET.Element | None:
     return next((child for child in element if snake_case(child.get("name", "")) == name), None)
 
 
-def _pop(element: ET.Element, name: str) -> ET.Element | None:
-    child = _property(element, name)
-    if child is not None:
-        element.remove(child)
-    return child
-
-
 def linear(encoded: np.ndarray) -> np.ndarray:
     """Convert sRGB to linear, both in [0, 1]."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _set(element: ET.Element, tag: str, name: str, value: object) -> None:
-    _pop(element, name)
+    old = _property(element, name)
+    if old is not None:
+        element.remove(old)
     ET.SubElement(element, tag, name=name, value=str(value))
 
 
@@ -144,15 +137,14 @@ def _transform(element: ET.Element) -> ET.Element:
 
 
 def _drop(document: Document, root: ET.Element) -> None:
-    media = 0
+    """Drop media, and what nlt has its own of."""
     for parent in list(root.iter()):
         for child in list(parent):
             is_medium = child.tag in _MEDIA or child.get("name") in ("interior", "exterior")
+            if is_medium:
+                document.warnings["media and subsurface scattering are ignored: nlt traces only surfaces"] = 1
             if is_medium or child.tag in _DROPPED:
-                media += is_medium
                 parent.remove(child)
-    if media:
-        document.warnings["media and subsurface scattering are ignored: nlt traces only surfaces"] += 1
 
 
 def _flatten_shapes(document: Document, root: ET.Element) -> None:
@@ -216,40 +208,48 @@ def _value(element: ET.Element) -> None:
     elif element.tag == "spectrum" and value and ":" not in value:
         element.tag = "rgb"  # one or three plain numbers, which the RGB mode of Mitsuba 0.x read as linear RGB
     elif element.tag == "srgb" or (element.tag == "rgb" and value.startswith("#")):
-        is_hex = value.startswith("#")
-        encoded = np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255 if is_hex else _numbers(element)
+        if value.startswith("#"):
+            encoded = np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255
+        else:
+            encoded = np.array(re.split(r"[\s,]+", value), float)
         element.tag = "rgb"
         element.set("value", ", ".join(f"{v:.6g}" for v in linear(encoded)))
 
 
-def _numbers(element: ET.Element) -> np.ndarray:
-    return np.array(re.split(r"[\s,]+", element.get("value", "").strip()), float)
-
-
 def _texture(element: ET.Element) -> None:
     """Replace options of images that Mitsuba 3 refuses or ignores."""
-    filtering = _property(element, "filter_type")
+    filtering, gamma = _property(element, "filter_type"), _property(element, "gamma")
     if filtering is not None and filtering.get("value") not in ("nearest", "bilinear"):
         element.remove(filtering)  # trilinear, ewa: Mitsuba 3 has no mipmaps
-    gamma = _property(element, "gamma")
     if gamma is not None and float(gamma.get("value", 0)) == 1:
         element.remove(gamma)
         _set(element, "boolean", "raw", "true")
 
 
-def _emitter(document: Document, element: ET.Element) -> None:
-    """Convert a light of the scene: sun and sky, or a point or spot light. Other lights without an area are dropped."""
-    kind, root = element.get("type", ""), document.root
-    if kind in ("sun", "sky", "sunsky"):
-        _sky(document, element)
-    elif kind not in _ENVIRONMENTS:
+def _convert_lights(document: Document, root: ET.Element) -> None:
+    """Convert sun, sky, point and spot lights; keep one environment, and drop other lights without an area."""
+    kept = ""
+    for element in root.findall("emitter"):
+        kind = element.get("type", "")
+        if kind in ("sun", "sky", "sunsky"):
+            element.set("type", "sunsky")
+            if document.old:  # up was +y in Mitsuba 0.x and is +z in Mitsuba 3
+                _transform(element).insert(0, ET.Element("rotate", x="1", angle="-90"))
+            for part in ("sun", "sky"):
+                if part not in kind:
+                    _set(element, "float", f"{part}_scale", 0)
+        if element.get("type") in _ENVIRONMENTS and not kept:
+            kept = kind
+            continue
         root.remove(element)
-        if kind in ("point", "spot"):
+        if element.get("type") in _ENVIRONMENTS:
+            text = f"Mitsuba allows one environment: {kept} is kept, {kind} ignored"
+        elif kind in _LAMPS:
             root.append(_lamp(element))
-            text = f"is replaced by a {_LAMPS[kind]} of radius {LAMP_RADIUS:g} and the same intensity"
+            text = f"a {kind} light is replaced by a {_LAMPS[kind]} of radius {LAMP_RADIUS:g} and the same intensity"
         else:
-            text = "is ignored: nlt has only area lights and environments"
-        document.warnings[f"a {kind} light {text}"] += 1
+            text = f"a {kind} light is ignored: nlt has only area lights and environments"
+        document.warnings[text] += 1
 
 
 def _lamp(light: ET.Element) -> ET.Element:
@@ -257,57 +257,18 @@ def _lamp(light: ET.Element) -> ET.Element:
     kind = light.get("type", "")
     lamp = ET.Element("shape", type=_LAMPS[kind], id=light.get("id", f"{kind}_light"))
     lamp.extend(light.findall("transform"))
-    position, intensity = _property(light, "position"), _property(light, "intensity")
-    if position is not None:
-        position.set("name", "center")
-        lamp.append(position)
     if kind == "point":
         _set(lamp, "float", "radius", LAMP_RADIUS)
     else:
         _transform(lamp).insert(0, ET.Element("scale", value=str(LAMP_RADIUS)))
+    position, intensity = _property(light, "position"), _property(light, "intensity")
+    if position is not None:
+        position.set("name", "center")
+        lamp.append(position)
     values = re.split(r"[\s,]+", "1" if intensity is None else intensity.get("value", "1").strip())
     radiance = [float(v.split(":")[-1]) / (np.pi * LAMP_RADIUS**2) for v in values]
-    emitter = ET.SubElement(lamp, "emitter", type="area")
-    _set(emitter, "rgb", "radiance", ", ".join(f"{v:.6g}" for v in radiance))
+    _set(ET.SubElement(lamp, "emitter", type="area"), "rgb", "radiance", ", ".join(f"{v:.6g}" for v in radiance))
     return lamp
-
-
-def _sky(document: Document, element: ET.Element) -> None:
-    """Convert a sun, a sky or both; a part that is absent has the scale zero."""
-    kind = element.get("type")
-    if document.old:  # up was +y in Mitsuba 0.x and is +z in Mitsuba 3
-        _transform(element).insert(0, ET.Element("rotate", x="1", angle="-90"))
-    scale, radius = _pop(element, "scale"), _pop(element, "sun_radius_scale")
-    for part in ("sun", "sky"):
-        if part not in str(kind):
-            _set(element, "float", f"{part}_scale", 0)
-        elif scale is not None:
-            _set(element, "float", f"{part}_scale", scale.get("value"))
-    if radius is not None:
-        _set(element, "float", "sun_aperture", f"{0.5358 * float(radius.get('value', 1)):.6g}")
-    for name in ("stretch", "resolution", "extend", "filename"):
-        _pop(element, name)
-    element.set("type", "sunsky")
-
-
-def _one_environment(document: Document, root: ET.Element) -> None:
-    """Keep the first environment, joined with a second one if these are a sun and a sky."""
-    environments = [e for e in root.findall("emitter") if e.get("type") in _ENVIRONMENTS]
-    for other in environments[1:]:
-        first = environments[0]
-        root.remove(other)
-        scales = {part: _property(first, f"{part}_scale") for part in ("sun", "sky")}
-        absent = [part for part, scale in scales.items() if scale is not None and float(scale.get("value", 1)) == 0]
-        if not (first.get("type") == other.get("type") == "sunsky" and absent):
-            kinds = f"{first.get('type')} is kept, {other.get('type')} ignored"
-            document.warnings[f"Mitsuba allows one environment: {kinds}"] += 1
-            continue
-        _pop(first, f"{absent[0]}_scale")
-        for name in (f"{absent[0]}_scale", "sun_direction", "sun_aperture"):
-            given = _property(other, name)
-            if given is not None:
-                _pop(first, name)
-                first.append(given)
 
 
 def _name_shapes(root: ET.Element) -> None:

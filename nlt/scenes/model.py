@@ -183,8 +183,12 @@ def _gltf_surface(
     if not (visual.material.name or "").isdigit():
         return Material((1.0, 1.0, 1.0)), uv
     source = int(visual.material.name)
-    material = converted[source]
-    _images(material, visual.material)
+    material, loaded = converted[source], visual.material
+    assert isinstance(loaded, trimesh.visual.material.PBRMaterial)
+    material.image, material.rough_image = loaded.baseColorTexture, loaded.metallicRoughnessTexture
+    material.emission_image = loaded.emissiveTexture
+    if material.image is not None and loaded.alphaMode in ("MASK", "BLEND") and "A" in material.image.getbands():
+        material.alpha_image = material.image.getchannel("A")
     if "baseColorTexture" in materials[source].get("pbrMetallicRoughness", {}) and material.image is None:
         model.warnings["an unreadable image is ignored"] += 1
     return material, None if uv is None else _texture_transform(materials[source], uv)
@@ -214,15 +218,6 @@ def _gltf_material(data: dict[str, Any], model: Model) -> Material:
     )
 
 
-def _images(material: Material, loaded: Any) -> None:
-    """Copy the images that trimesh has loaded to a material."""
-    material.image, material.rough_image = loaded.baseColorTexture, loaded.metallicRoughnessTexture
-    material.emission_image = loaded.emissiveTexture
-    image = loaded.baseColorTexture
-    if image is not None and loaded.alphaMode in ("MASK", "BLEND") and "A" in image.getbands():
-        material.alpha_image = image.getchannel("A")
-
-
 def _texture_transform(material: dict[str, Any], uv: np.ndarray) -> np.ndarray:
     """Apply the KHR_texture_transform of one texture, which all textures of the material then share."""
     candidates = (material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), material.get("emissiveTexture"))
@@ -234,7 +229,8 @@ def _texture_transform(material: dict[str, Any], uv: np.ndarray) -> np.ndarray:
 
 
 # OBJ files are parsed here because trimesh joins all parts of one material and loses the texture coordinates of quads.
-_MAPS = ("map_kd", "map_d", "map_ke")
+_MAPS = {"map_kd": "image", "map_d": "alpha_image", "map_ke": "emission_image"}
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
@@ -271,7 +267,17 @@ def read_obj(path: Path) -> Model:
         for (name, material_name), faces in parts.items():
             if material_name not in materials:
                 model.warnings[f"material {material_name or '(none)'} is not in the MTL files: replaced by grey"] += 1
-            model.parts.append((name, _triangles(faces, arrays), materials.get(material_name, Material())))
+            unique, inverse = np.unique(np.array(faces).reshape(-1, 3), axis=0, return_inverse=True)
+            vertices, uv, normals = (
+                np.array([array[k] for k in indices]) if (indices >= 0).all() else None
+                for indices, array in zip(unique.T, arrays.values(), strict=True)
+            )
+            if vertices is None:
+                raise ValueError("a face without vertices")
+            # In OBJ, v = 0 is the bottom row of an image.
+            uv = None if uv is None else uv * [1, -1] + [0, 1]
+            triangles = Triangles(vertices, inverse.reshape(-1, 3), normals, uv)
+            model.parts.append((name, triangles, materials.get(material_name, Material())))
     except (ValueError, IndexError) as error:
         raise UserError(f"{path}: not readable as OBJ: {error}") from None
     return model
@@ -287,18 +293,6 @@ def _corner(word: str, arrays: dict[str, list[list[float]]]) -> tuple[int, ...]:
     return tuple(indices)
 
 
-def _triangles(faces: list[list[tuple[int, ...]]], arrays: dict[str, list[list[float]]]) -> Triangles:
-    corners = np.array(faces).reshape(-1, 3)
-    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
-    attributes = [np.array([array[k] for k in unique[:, c]]) if (unique[:, c] >= 0).all() else None
-             for c, array in enumerate(arrays.values())]  # fmt: skip
-    vertices, uv, normals = attributes
-    if vertices is None:
-        raise ValueError("a face without vertices")
-    # In OBJ, v = 0 is the bottom row of an image.
-    return Triangles(vertices, inverse.reshape(-1, 3), normals, None if uv is None else uv * [1, -1] + [0, 1])
-
-
 def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
     materials: dict[str, Material] = {}
     raw: dict[str, dict[str, list[str]]] = {}
@@ -308,24 +302,24 @@ def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
         elif raw:
             current[words[0].lower()] = words[1:]
     for name, data in raw.items():
-        number = lambda key, default, data=data: [float(w) for w in data.get(key, [])[:3] if _is_number(w)] or default
+        numbers = {key: [float(w) for w in words[:3] if _NUMBER.fullmatch(w)] for key, words in data.items()}
+        number = lambda key, default, numbers=numbers: numbers.get(key) or default
         opacity = number("d", [1 - number("tr", [0.0])[0]])[0]
         illumination, shininess = int(number("illum", [2])[0]), number("ns", [0.0])[0]
         shine = max(number("ks", [0.0]))
         glass = illumination in (4, 6, 7, 9) and (opacity < 1 or max(number("kd", [0.8])) < 0.2)
         mirror = illumination in (3, 5, 8) and not glass
-        material = Material(colour=tuple(number("kd", [0.8] * 3)), ior=number("ni", [1.5])[0], alpha=opacity)
+        ior = number("ni", [1.5])[0]
+        material = Material(colour=tuple(number("kd", [0.8] * 3)), ior=ior if ior > 1.01 else 1.5, alpha=opacity)
+        material.emission = tuple(number("ke", [0.0] * 3))
         if glass:
             material.colour, material.alpha = (1.0, 1.0, 1.0), 1.0
             material.transmission, material.thin, material.roughness = 1.0, False, 0.0
         elif mirror:
-            material.colour, material.metallic = tuple(number("ks", [1.0] * 3)), 1.0
-            material.roughness = 0.0
+            material.colour, material.metallic, material.roughness = tuple(number("ks", [1.0] * 3)), 1.0, 0.0
         elif shine > 0.01 and shininess > 1:
             material.roughness = float((2 / (shininess + 2)) ** 0.25)  # a highlight of the same width
-        material.ior = material.ior if material.ior > 1.01 else 1.5
-        material.emission = tuple(number("ke", [0.0] * 3))
-        for key, attribute in (("map_kd", "image"), ("map_ke", "emission_image"), ("map_d", "alpha_image")):
+        for key, attribute in _MAPS.items():
             if key in data:
                 image = Image.open(path.parent / data[key][-1].replace("\\", "/"))
                 setattr(material, attribute, image.convert("L") if key == "map_d" else image)
@@ -335,10 +329,3 @@ def _read_mtl(path: Path, model: Model) -> dict[str, Material]:
             material.colour = (1.0, 1.0, 1.0)
         materials[name] = material
     return materials
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False

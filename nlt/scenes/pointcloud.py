@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -44,10 +45,12 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
     shapes = list(scene.shapes.values())
     owner = {name: k for k, movable in enumerate(scene.movables) for name in movable.shapes}
     owners = np.array([owner.get(shape.id, -1) for shape in shapes])
-    is_visible = _VisibilityTest(scene, rng.spawn(1)[0])
+    views, unoccluded, rest = Views(scene), freeze(_unoccluded), rest_state(scene.description, scene.experiment)
+    (eye_rng,) = rng.spawn(1)
     kept: list[tuple[np.ndarray, ...]] = []
     accepted = tried = 0
-    with scene.in_state(is_visible.state):
+    with scene.in_state(SceneState(rest.translation, np.zeros_like(rest.present))):
+        eyes = [views.sample(1, eye_rng).position for _ in range(_EYES)]
         while accepted < count:
             if tried >= _MOST_CANDIDATES * count:
                 raise UserError(
@@ -59,7 +62,7 @@ def sample_points(scene: Scene, count: int, seed: int) -> dict[str, np.ndarray]:
             if scene.masks:
                 solid = ~_transparent(shapes, shape_index, uv)
                 shape_index, position, uv = shape_index[solid], position[solid], uv[solid]
-            seen = np.flatnonzero(is_visible(position, owners[shape_index] >= 0))
+            seen = np.flatnonzero(_visible(scene, unoccluded, eyes, position, owners[shape_index] >= 0))
             kept.append((shape_index[seen], position[seen], uv[seen]))
             accepted, tried = accepted + len(seen), tried + width
     shape_index, position, uv = (np.concatenate(column)[:count] for column in zip(*kept, strict=True))
@@ -90,41 +93,29 @@ def uniform_points(shapes: list[Shape], count: int, rng: np.random.Generator) ->
     for k in np.unique(shape_index):
         shape, rows = shapes[k], np.flatnonzero(shape_index == k)
         triangle = shape.faces[sample_cdf(areas[k], rng.random(len(rows)))]
-        weights = _barycentric(rng.random((len(rows), 2)))
+        weights = barycentric(rng.random((len(rows), 2)))
         position[rows] = np.einsum("nk,nkd->nd", weights, shape.vertices[triangle])
         if shape.uv is not None:
             uv[rows] = np.einsum("nk,nkd->nd", weights, shape.uv[triangle])
     return shape_index, position, uv
 
 
-class _VisibilityTest:
-    """Tests which points can become visible. Call it while the scene is in `state`, without its movable objects."""
-
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
-        self.scene = scene
-        rest = rest_state(scene.description, scene.experiment)
-        self.state = SceneState(rest.translation, np.zeros_like(rest.present))
-        views = Views(scene)
-        with scene.in_state(self.state):
-            self.eyes = [views.sample(1, rng).position for _ in range(_EYES)]
-        self._unoccluded = freeze(_unoccluded)
-
-    def __call__(self, position: np.ndarray, movable: np.ndarray) -> np.ndarray:
-        """Return (n,) bool for positions (n, 3) in metres; `movable` (n,) marks points on movable objects."""
-        room, units = self.scene.description.room, self.scene.description.units_per_metre
-        outside = np.zeros(len(position), bool)
-        if room is not None:
-            outside = ((position < room[0] - _RECESS) | (position > room[1] + _RECESS)).any(1)
-        seen = movable & ~outside
-        for eye in self.eyes:
-            rows = np.flatnonzero(~seen & ~outside)
-            if len(rows):
-                lanes = {
-                    "origin": ("Point3f", np.tile(eye * units, (len(rows), 1))),
-                    "reach": ("Vector3f", (position[rows] - eye) * units),
-                }
-                seen[rows] = launch(self._unoccluded, lanes, scene=self.scene.mi_scene, masks=self.scene.masks)[0]
-        return seen
+def _visible(
+    scene: Scene, unoccluded: Callable, eyes: list[np.ndarray], position: np.ndarray, movable: np.ndarray
+) -> np.ndarray:
+    """Return (n,) bool: which points (n, 3), in metres, lie near the room and are `movable` (n,) or seen by an eye."""
+    room, units = scene.description.room, scene.description.units_per_metre
+    inside = np.ones(len(position), bool)
+    if room is not None:
+        inside = ((position >= room[0] - _RECESS) & (position <= room[1] + _RECESS)).all(1)
+    seen = movable & inside
+    for eye in eyes:
+        rows = np.flatnonzero(inside & ~seen)
+        if len(rows):
+            origin, reach = np.tile(eye * units, (len(rows), 1)), (position[rows] - eye) * units
+            lanes = {"origin": ("Point3f", origin), "reach": ("Vector3f", reach)}
+            (seen[rows],) = launch(unoccluded, lanes, scene=scene.mi_scene, masks=scene.masks)
+    return seen
 
 
 def _unoccluded(scene: Any, masks: bool, origin: Any, reach: Any) -> tuple:
@@ -146,7 +137,7 @@ def _transparent(shapes: list[Shape], shape_index: np.ndarray, uv: np.ndarray) -
     return transparent
 
 
-def _barycentric(uniform: np.ndarray) -> np.ndarray:
+def barycentric(uniform: np.ndarray) -> np.ndarray:
     """Barycentric weights (n, 3) of uniform points in a triangle."""
     root = np.sqrt(uniform[:, 0])
     return np.stack([1 - root, root * (1 - uniform[:, 1]), root * uniform[:, 1]], axis=1)

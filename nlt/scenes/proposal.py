@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from nlt.scenes.assembly import Shape
 from nlt.scenes.description import Movable, MovingLight
 from nlt.scenes.lanes import launch
+from nlt.scenes.pointcloud import barycentric, sample_cdf
 
 UNITS = {"metres": 1.0, "decimetres": 10.0, "centimetres": 100.0, "millimetres": 1000.0, "inches": 39.37, "feet": 3.281}
 _HEIGHT = 2.7  # metres; the height of a usual room
@@ -58,7 +59,12 @@ def propose(scene: Any, shapes: Mapping[str, Shape], up: str | None) -> Proposal
         f"a guess: the room is {height:.4g} high, which is {height / UNITS[unit]:.2f} m if its units are {unit}"
     )
     rng = np.random.default_rng(0)
-    points = {name: _surface_points(shape, _TOUCH * height / 2, rng) for name, shape in upright.items()}
+    points = {}  # each shape's vertices and random points on its surface
+    for name, shape in upright.items():
+        count = int(np.clip(shape.face_areas.sum() / (_TOUCH * height / 2) ** 2, 30, 20000))
+        triangles = shape.vertices[shape.faces[sample_cdf(shape.face_areas, rng.random(count))]]
+        on_surface = np.einsum("nk,nkd->nd", barycentric(rng.random((2, count)).T), triangles)
+        points[name] = np.concatenate([shape.vertices, on_surface])
     furniture = _Furniture(rays, points, room)
     world = lambda box: box[:, np.argsort(rays.order)]
     objects = tuple(
@@ -67,8 +73,11 @@ def propose(scene: Any, shapes: Mapping[str, Shape], up: str | None) -> Proposal
         if any(shapes[n].emitter is None for n in names)  # the light of a window moves only with the window
     )
     camera, because["camera"] = _camera(rays, room)
-    light = _light(room)
-    light = replace(light, box=world(light.box))
+    # The light hangs under the middle of the ceiling and has a quarter of its width and length.
+    size = np.ptp(room, axis=0)
+    places = room.mean(0) + 0.25 * size * _OUTWARD
+    places[:, 2] = room[1, 2] - 0.04 * size[2]
+    light = MovingLight(0.25 * size[:2], np.array([15.0, 13.6, 11.6]), world(places))
     return Proposal(up, UNITS[unit], world(bounds), world(room), world(camera), objects, light, because)
 
 
@@ -80,15 +89,9 @@ class _Rays:
 
     def __call__(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the distances (n,) to the first hits of rays (n, 3), inf for rays that hit nothing."""
-
-        def kernel(origin: Any, direction: Any) -> tuple:
-            return (self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))).t,)
-
-        origins, directions = np.broadcast_arrays(origins, directions)
-        back = np.argsort(self.order)
-        lanes = {"origin": ("Point3f", origins[:, back]), "direction": ("Vector3f", directions[:, back])}
-        (t,) = launch(kernel, lanes)
-        return t.astype(float)
+        kernel = lambda origin, direction: (self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction)).t,)
+        rays = np.stack(np.broadcast_arrays(origins, directions))[..., np.argsort(self.order)]
+        return launch(kernel, {"origin": ("Point3f", rays[0]), "direction": ("Vector3f", rays[1])})[0].astype(float)
 
 
 def _box(points: np.ndarray) -> np.ndarray:
@@ -99,18 +102,14 @@ def _guess_up(shapes: Mapping[str, Shape]) -> str:
     """Return the axis that most area faces, like floors and ceilings; y if two axes tie."""
     area = np.zeros(3)
     for shape in shapes.values():
-        a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
-        normals = np.cross(b - a, c - a) / 2
-        size = np.linalg.norm(normals, axis=1)
-        flat = np.abs(normals) > 0.98 * size[:, None]
-        area += (size[:, None] * flat).sum(0)
+        size = shape.face_areas[:, None]
+        area += (size * (np.abs(shape.face_normals) > 0.98 * size)).sum(0)
     return max("yzx", key=lambda u: round(float(area["xyz".index(u)]), 6))
 
 
 def _grid(box: np.ndarray, layers: tuple[int, int, int]) -> np.ndarray:
     """Cell centres (n, 3) of a regular grid in a box."""
-    cells = np.stack(np.meshgrid(*map(np.arange, layers), indexing="ij"), axis=-1).reshape(-1, 3)
-    return box[0] + (box[1] - box[0]) * (cells + 0.5) / layers
+    return box[0] + (box[1] - box[0]) * (np.indices(layers).reshape(3, -1).T + 0.5) / layers
 
 
 def _level(heights: np.ndarray, tolerance: float, highest: bool) -> float:
@@ -162,17 +161,6 @@ def _room(rays: _Rays, boxes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarra
     open_sides = [name for name, side in sides.items() if not ended[side]]
     reason = "where rays from the middle end"
     return room, reason + (f"; no rays end at the {', '.join(open_sides)}" if open_sides else "")
-
-
-def _surface_points(shape: Shape, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the shape's vertices and random points on its surface."""
-    areas = shape.face_areas
-    count = int(np.clip(areas.sum() / spacing**2, 30, 20000))
-    cdf = np.cumsum(areas)
-    triangle = np.searchsorted(cdf, rng.random(count) * cdf[-1]).clip(max=len(areas) - 1)
-    root, other = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
-    a, b, c = (shape.vertices[shape.faces[triangle, k]] for k in range(3))
-    return np.concatenate([shape.vertices, (1 - root) * a + root * (1 - other) * b + root * other * c])
 
 
 class _Furniture:
@@ -252,7 +240,7 @@ class _Furniture:
         own = np.concatenate([self.points[n] for n in names])
         others = np.concatenate([np.empty((0, 3)), *(p for n, p in self.points.items() if n not in names)])
         box = _box(own)
-        floor = _Floor(box + reach * _OUTWARD, cell)
+        floor = _Floor(box, reach, cell)
         blocked = floor.occupied(others[(others[:, 2] > box[0, 2] + 2 * cell) & (others[:, 2] < box[1, 2] - cell)])
         blocked[floor.rectangle(box)] = False
         centres = floor.centres(box[0, 2] + cell)
@@ -264,14 +252,14 @@ class _Furniture:
         ring[floor.rectangle(feet, margin=2)] = True
         ring &= ~under & ~outside  # only around its feet: under them, rays would hit the group itself
         if ring.any() and carried[ring].mean() > 0.5:
-            return floor.room_to_move(blocked | outside | (~carried & ~under), box, reach)
+            return floor.room_to_move(blocked | outside | (~carried & ~under), reach)
         if box[1, 2] > room[1, 2] - 3 * cell and box[1, 2] - box[0, 2] < 0.5 * self.height:  # a lamp on the ceiling
-            return floor.room_to_move(blocked | outside, box, reach / 3)
-        return self._along_wall(floor, box, others)
+            return floor.room_to_move(blocked | outside, reach / 3)
+        return self._along_wall(floor, others)
 
-    def _along_wall(self, floor: _Floor, box: np.ndarray, others: np.ndarray) -> np.ndarray | None:
+    def _along_wall(self, floor: _Floor, others: np.ndarray) -> np.ndarray | None:
         """Return the translations (2, 3) of a group that hangs on a wall, or None if it does not."""
-        room, cell = self.room, self.cell
+        room, box, cell = self.room, floor.box, self.cell
         thin = int(np.ptp(box, axis=0)[:2].argmin())
         gaps = np.abs(box[:, thin] - room[:, thin])
         if np.ptp(box[:, thin]) > 0.1 * self.height or gaps.min() > 0.06 * self.height:
@@ -284,15 +272,16 @@ class _Furniture:
         blocked = (along < room[0, 1 - thin]) | (along > room[1, 1 - thin])
         blocked |= floor.occupied(others[level]).any(thin, keepdims=True)
         blocked[floor.rectangle(box)] = False
-        return floor.room_to_move(blocked, box, _REACH * self.height / 3, axes=(1 - thin,))
+        return floor.room_to_move(blocked, _REACH * self.height / 3, axes=(1 - thin,))
 
 
 class _Floor:
-    """A horizontal grid of square cells that covers a box `area` (2, 3)."""
+    """A horizontal grid of square cells around a `box` (2, 3), up to a distance of `reach`."""
 
-    def __init__(self, area: np.ndarray, cell: float) -> None:
-        (self.low, self.high), self.cell = area[:, :2], cell
-        self.shape = np.ceil((self.high - self.low) / cell).astype(int)
+    def __init__(self, box: np.ndarray, reach: float, cell: float) -> None:
+        area = box + reach * _OUTWARD
+        self.box, self.low, self.cell = box, area[0, :2], cell
+        self.shape = np.ceil(np.ptp(area, axis=0)[:2] / cell).astype(int)
 
     def centres(self, height: float) -> np.ndarray:
         """Return the centres (n, 3) of all cells at a height."""
@@ -300,26 +289,22 @@ class _Floor:
         return np.column_stack([level, np.full(len(level), height)])
 
     def _cells(self, points: np.ndarray) -> np.ndarray:
-        """Return the cells (n, 2) of points (n, 3)."""
-        return np.floor((points[:, :2] - self.low) / self.cell).astype(int).clip(0, self.shape - 1)
+        """Return the cells (n, 2) of points (n, 3); points outside the grid are in the nearest cell."""
+        return ((points[:, :2] - self.low) / self.cell).astype(int).clip(0, self.shape - 1)
 
     def occupied(self, points: np.ndarray) -> np.ndarray:
         """Return whether there are points in each cell."""
-        grid = np.zeros(self.shape, bool)
-        near = ((points[:, :2] > self.low) & (points[:, :2] < self.high)).all(1)
-        grid[tuple(self._cells(points[near]).T)] = True
-        return grid
+        edges = [low + self.cell * np.arange(n + 1) for low, n in zip(self.low, self.shape, strict=True)]
+        return np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
 
     def rectangle(self, box: np.ndarray, margin: int = 0) -> tuple[slice, ...]:
         """Return the cells below a box (2, 3), with a margin around them."""
         first, last = self._cells(box)
         return tuple(slice(max(a - margin, 0), b + margin + 1) for a, b in zip(first, last, strict=True))
 
-    def room_to_move(
-        self, blocked: np.ndarray, box: np.ndarray, most: float, axes: tuple[int, ...] = (0, 1)
-    ) -> np.ndarray:
-        """Return the translations (2, 3), each at most `most` long, that keep a box (2, 3) out of all blocked cells."""
-        blocked, corners = np.pad(blocked, 1, constant_values=True), self._cells(box) + 1
+    def room_to_move(self, blocked: np.ndarray, most: float, axes: tuple[int, ...] = (0, 1)) -> np.ndarray:
+        """Return the translations (2, 3), each at most `most` long, that keep the box out of all blocked cells."""
+        blocked, corners = np.pad(blocked, 1, constant_values=True), self._cells(self.box) + 1
         steps = np.zeros((2, 2), int)
         growing = [(side, k) for k in axes for side in (0, 1)]
         while growing:
@@ -335,20 +320,17 @@ class _Floor:
 
 
 def _touching(clouds: list[np.ndarray], distance: float) -> np.ndarray:
-    """Label connected clouds (n,): two clouds touch if they have points in the same cell of a grid."""
+    """Label connected clouds (n,): two clouds touch if they have points in the same cell of one of two grids."""
     owner = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-    points = np.concatenate(clouds)
-    pairs = []
-    for shift in (0.0, 0.5):
-        cells = np.floor(points / distance + shift).astype(np.int64)
-        cells -= cells.min(0)
-        flat_cell = np.ravel_multi_index(cells.T, tuple(cells.max(0) + 1))
-        cell, cloud = np.divmod(np.unique(flat_cell * len(clouds) + owner), len(clouds))
-        same = cell[1:] == cell[:-1]
-        pairs.append(np.column_stack([cloud[:-1][same], cloud[1:][same]]))
-    first, second = np.concatenate(pairs).T
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(clouds), len(clouds)))
-    return connected_components(graph, directed=False)[1]
+    points = np.concatenate(clouds) / distance
+    cells = np.concatenate([np.column_stack([np.floor(points + k / 2), np.full(len(points), k)]) for k in (0, 1)])
+    cells = (cells - cells.min(0)).astype(np.int64)
+    # A graph whose nodes are the clouds and then the cells: points connect their cloud with their cells.
+    _, cell = np.unique(np.ravel_multi_index(cells.T, cells.max(0) + 1), return_inverse=True)
+    links = np.tile(owner, 2), len(clouds) + cell
+    count = len(clouds) + cell.max() + 1
+    graph = coo_array((np.ones(len(cell)), links), shape=(count, count))
+    return connected_components(graph, directed=False)[1][: len(clouds)]
 
 
 def _camera(rays: _Rays, room: np.ndarray) -> tuple[np.ndarray, str]:
@@ -374,11 +356,3 @@ def _camera(rays: _Rays, room: np.ndarray) -> tuple[np.ndarray, str]:
         high[k] -= side == 1
     size = np.ptp(box, axis=0) / layers
     return np.stack([box[0] + low * size, box[0] + high * size]), f"{part.mean():.0%} of its points are free"
-
-
-def _light(room: np.ndarray) -> MovingLight:
-    """Place a light under the middle of the ceiling, with a quarter of its width and length."""
-    size = np.ptp(room, axis=0)
-    box = np.stack([room.mean(0), room.mean(0)]) + 0.25 * size * _OUTWARD
-    box[:, 2] = room[1, 2] - 0.04 * size[2]
-    return MovingLight(0.25 * size[:2], np.array([15.0, 13.6, 11.6]), box)

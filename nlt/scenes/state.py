@@ -9,16 +9,12 @@ import numpy as np
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import SceneDescription
 
-REMOVAL_PROBABILITY = 0.2
-
 
 @dataclass(frozen=True)
 class SceneState:
-    """The translation and presence of each of the M movable objects.
+    """The state of the M movable objects: `translation` (M, 3) float32 and `present` (M,) bool.
 
-    Attributes:
-        translation: (M, 3) float32, metres, relative to the position in the scene file; zero for a removed object.
-        present: (M,) bool.
+    Translations are in metres, from the position in the scene file; that of a removed object is zero.
     """
 
     translation: np.ndarray
@@ -43,7 +39,7 @@ def sample_state(description: SceneDescription, experiment: str, rng: np.random.
         return rest_state(description, experiment)
     boxes = np.stack([m.box for m in movables])
     translation = rng.uniform(boxes[:, 0], boxes[:, 1])
-    removed = rng.random(len(movables)) < REMOVAL_PROBABILITY
+    removed = rng.random(len(movables)) < 0.2
     present = ~removed | np.array([not m.removable for m in movables])
     return SceneState(np.where(present[:, None], translation, 0.0).astype(np.float32), present)
 

@@ -81,8 +81,7 @@ def cameras(description: SceneDescription, path: str, frames: int, width: int, h
         keys = np.array([(view.position, view.target) for view in read.views])
         positions, targets = (follow(keys[:, end], frames, read.closed) for end in (0, 1))
         fov = read.fov or fov
-    for k, (position, target) in enumerate(zip(positions, targets, strict=True)):
-        direction = target - position
+    for k, direction in enumerate(targets - positions):
         if np.linalg.norm(np.cross(direction, up)) <= 1e-3 * np.linalg.norm(direction):
             raise UserError(f"--camera-path: {path}: frame {k} looks straight up or down, or nowhere; move the target")
     return [Camera.look_at(p, t, up, fov, width, height) for p, t in zip(positions, targets, strict=True)]
@@ -106,10 +105,19 @@ def states(
         read = _State(seed=int(state))
     else:
         read = parse(_State, {k: v for k, v in read_configs([Path(state).absolute()]).items() if v is not None}, state)
-    base = _first_state(description, experiment, read, state)
+    if read.seed is None:
+        base = rest_state(description, experiment)
+    else:
+        base = sample_state(description, experiment, np.random.default_rng(read.seed))
+    names = [movable.name for movable in description.movables(experiment)]
+    for name, place in read.objects.items():
+        if name == MOVING_LIGHT or name not in names:
+            known = ", ".join(other for other in names if other != MOVING_LIGHT)
+            raise UserError(f"{state}: objects.{name}: unknown object; known are {known}")
+        base.present[names.index(name)] = place != "removed"
+        base.translation[names.index(name)] = 0 if place == "removed" else place
     if not light and read.light is None:
         return [base] * frames
-    names = [movable.name for movable in description.movables(experiment)]
     if description.light is None or MOVING_LIGHT not in names:
         raise UserError(f"--light: {description.name} has no moving light in the experiment {experiment}")
     if light:
@@ -120,19 +128,3 @@ def states(
     for moment, position in zip(moved, positions, strict=True):
         moment.translation[names.index(MOVING_LIGHT)] = position - description.light.centre
     return moved
-
-
-def _first_state(description: SceneDescription, experiment: str, read: _State, path: str) -> SceneState:
-    """Return the state that a file describes, before its light moves."""
-    if read.seed is None:
-        state = rest_state(description, experiment)
-    else:
-        state = sample_state(description, experiment, np.random.default_rng(read.seed))
-    names = [movable.name for movable in description.movables(experiment) if movable.name != MOVING_LIGHT]
-    for name, place in read.objects.items():
-        if name not in names:
-            raise UserError(f"{path}: objects.{name}: unknown object; known are {', '.join(names)}")
-        row = names.index(name)
-        state.present[row] = place != "removed"
-        state.translation[row] = 0 if place == "removed" else place
-    return state

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,14 +26,6 @@ _TRIES = 100
 _LIMITS = {"back": 0.3, "near": 0.3, "nothing": 0.5}
 
 
-class Shares(NamedTuple):
-    """Shares of a view's rays. `back` and `nothing` are the larger share of: around the camera, through the image."""
-
-    back: float  # rays that hit a surface from behind
-    near: float  # rays through the image that hit a surface within 0.2 m
-    nothing: float  # rays that hit no surface
-
-
 class Views:
     """Samples random views of a scene."""
 
@@ -45,7 +37,14 @@ class Views:
         angle = np.pi * (1 + np.sqrt(5)) * np.arange(_RAYS)
         radius = np.sqrt(1 - z**2)
         self._sphere = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
-        self._inverted = self._find_inverted()
+        # Shapes are inside out if most rays from the camera volume hit their backs.
+        rng, description = np.random.default_rng(0), scene.description
+        with scene.in_state(rest_state(description, scene.experiment)):
+            looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
+        distance, behind, shape = (np.concatenate(column) for column in zip(*looks, strict=True))
+        hit = np.isfinite(distance)
+        numbers, inverse = np.unique(shape[hit], return_inverse=True)
+        self._inverted = numbers[np.bincount(inverse, behind[hit]) > np.bincount(inverse) / 2]
 
     def sample(self, resolution: int, rng: np.random.Generator) -> Camera:
         """Return a random view of the scene in its current state that passes the check.
@@ -60,22 +59,26 @@ class Views:
         shares = self.shares(camera)
         raise UserError(
             f"{self.scene.description.file}: camera: none of {_TRIES} random views shows the room (of the last one's "
-            f"rays, {shares.back:.0%} hit surfaces from behind, {shares.near:.0%} hit surfaces within {_NEAR} m, "
-            f"{shares.nothing:.0%} hit none); move the box into the room"
+            f"rays, {shares['back']:.0%} hit surfaces from behind, {shares['near']:.0%} hit surfaces within {_NEAR} m, "
+            f"{shares['nothing']:.0%} hit none); move the box into the room"
         )
 
     def passes(self, camera: Camera) -> bool:
-        return all(share <= _LIMITS[name] for name, share in self.shares(camera)._asdict().items())
+        return all(share <= _LIMITS[name] for name, share in self.shares(camera).items())
 
-    def shares(self, camera: Camera) -> Shares:
-        """Return the shares of a view's rays that mark a bad view, in the current state."""
+    def shares(self, camera: Camera) -> dict[str, float]:
+        """Return the shares of rays that mark a bad view, in the current state.
+
+        `back` hit a surface from behind, and `nothing` hit no surface; each is the larger share of two: around the
+        camera and through the image. `near` is the share through the image that hits a surface within 0.2 m.
+        """
         side = int(np.sqrt(_RAYS))
         rows, columns = (np.mgrid[:side, :side] + 0.5) / side
         image = camera.directions(np.stack([columns.ravel() * camera.width, rows.ravel() * camera.height], 1))
         distance, behind, shape = self.look(camera.position, np.concatenate([self._sphere, image]))
         back = behind ^ np.isin(shape, self._inverted)
         share = lambda mask: max(half.mean() for half in np.split(mask, 2))
-        return Shares(share(back), (distance[_RAYS:] < _NEAR).mean(), share(np.isinf(distance)))
+        return {"back": share(back), "near": (distance[_RAYS:] < _NEAR).mean(), "nothing": share(np.isinf(distance))}
 
     def look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return, for each ray, the distance in metres, whether it hits the back of a shape, and a shape number."""
@@ -84,17 +87,6 @@ class Views:
         lanes = {"origin": ("Point3f", origins), "direction": ("Vector3f", directions)}
         distance, behind, shape = launch(self._first_hit, lanes, scene=self.scene.mi_scene)
         return distance / units, behind, shape
-
-    def _find_inverted(self) -> np.ndarray:
-        """Return the shapes that are inside out: most rays from the camera volume hit their backs."""
-        rng = np.random.default_rng(0)
-        description = self.scene.description
-        with self.scene.in_state(rest_state(description, self.scene.experiment)):
-            looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
-        distance, behind, shape = (np.concatenate(column) for column in zip(*looks, strict=True))
-        hit = np.isfinite(distance)
-        numbers, inverse = np.unique(shape[hit], return_inverse=True)
-        return numbers[np.bincount(inverse, behind[hit]) > np.bincount(inverse) / 2]
 
 
 def _first_hit(scene: Any, origin: Any, direction: Any) -> tuple:

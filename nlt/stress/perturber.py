@@ -213,7 +213,7 @@ def corner(view: ViewPerturber, metres: float) -> None:
         walls, place = room[ends, view.horizontal], view.camera.position
         place[view.horizontal] = walls + np.sign(view.middle[view.horizontal] - walls) * metres
         cameras.append(view.camera_at(place, view.middle))
-    view.camera = min(cameras, key=lambda camera: view.render.views.shares(camera).back)
+    view.camera = min(cameras, key=lambda camera: view.render.views.shares(camera)["back"])
 
 
 _LIGHT_CHANGES: dict[str, Callable[[ViewPerturber, float], None]] = {

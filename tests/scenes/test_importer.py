@@ -100,6 +100,10 @@ def write(path, text):
     return path
 
 
+def load(path):
+    return importer.read(path).scene
+
+
 def picture(scene, spp=4):
     """(16, 16, 3) linear radiance from a fixed camera."""
     sensor = mi.load_dict(
@@ -151,7 +155,7 @@ def test_every_missing_file_is_named(folder):
     (folder / "textures" / "sky.exr").unlink()
     (folder / "models" / "Mesh001.obj").unlink()
     path = write(folder / "old.xml", OLD.replace("</scene>", '<include filename="more.xml"/></scene>'))
-    refused(lambda: importer.load(path), path, "missing: models/Mesh001.obj, more.xml, textures/sky.exr; add them")
+    refused(lambda: load(path), path, "missing: models/Mesh001.obj, more.xml, textures/sky.exr; add them")
 
 
 @pytest.mark.parametrize(
@@ -179,7 +183,7 @@ def test_unreadable_files_are_refused(tmp_path, name, content, fragments):
         path.write_text(content)
     elif name.endswith("/"):
         path.mkdir()
-    refused(lambda: importer.load(path), path, *fragments)
+    refused(lambda: load(path), path, *fragments)
 
 
 DIFFUSE = '<bsdf type="diffuse"/>'
@@ -196,7 +200,7 @@ LOST = {
 @pytest.mark.parametrize(("bsdf", "word"), LOST.items(), ids=LOST.values())
 def test_lost_materials_are_refused(tmp_path, bsdf, word):
     path = write(tmp_path / "scene.xml", f'<scene version="0.6.0"><shape type="cube">{bsdf}</shape></scene>')
-    refused(lambda: importer.load(path), path, word, "edit it")
+    refused(lambda: load(path), path, word, "edit it")
 
 
 def test_old_values_of_materials(tmp_path):
@@ -216,9 +220,7 @@ def test_old_values_of_materials(tmp_path):
         warning = "gamma of bitmap texture is ignored: Mitsuba 3 does not know it"
         assert read.warnings == ((warning,) if 'value="2"' in value else ())
     glass = '<bsdf type="dielectric"><string name="intIOR" value="bk7"/></bsdf>'
-    scene = importer.load(
-        write(tmp_path / "scene.xml", f'<scene version="0.6.0"><shape type="cube">{glass}</shape></scene>')
-    )
+    scene = load(write(tmp_path / "scene.xml", f'<scene version="0.6.0"><shape type="cube">{glass}</shape></scene>'))
     assert material(scene.shapes()[0].bsdf()) == "glass"
 
 
@@ -245,7 +247,7 @@ def test_analytic_shapes_become_meshes(tmp_path, kind, flip):
     glow = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'
     shape = f'<shape type="{kind}">{place}{flip}<bsdf type="twosided">{DIFFUSE}</bsdf>{glow}</shape>'
     path = write(tmp_path / "scene.xml", f'<scene version="0.6.0">{shape}</scene>')
-    (mesh,) = importer.load(path).shapes()
+    (mesh,) = load(path).shapes()
     (exact,) = mi.load_file(str(path), optimize=False).shapes()
     assert isinstance(mesh, mi.Mesh) and mesh.is_emitter() and mesh.id() == kind
     assert "vertex_positions" in mi.traverse(mesh)
@@ -292,20 +294,21 @@ def test_instances_become_shapes(tmp_path):
     assert "fur is a hair" in read.warnings[1] and "directional" in read.warnings[0]
 
 
-def test_sun_and_sky_are_one_and_stand_upright(tmp_path):
+def test_sun_and_sky_stand_upright(tmp_path):
     """Mitsuba 0.6's sky has +y up, Mitsuba 3's +z; the sun stands where it is said to in both."""
     sun = '<emitter type="sun"><vector name="sunDirection" x="0.8" y="0.5" z="0.3"/></emitter>'
     sky = '<emitter type="sky"><float name="turbidity" value="3"/></emitter>'
-    xml = f'<scene version="0.6.0"><shape type="cube"/>{sky}{sun}</scene>'
-    environment = importer.load(write(tmp_path / "scene.xml", xml)).environment()
+    scenes = [f'<scene version="0.6.0"><shape type="cube"/>{lights}</scene>' for lights in (sun, sky, sky + sun)]
+    suns, skies, both = (importer.read(write(tmp_path / "scene.xml", xml)) for xml in scenes)
 
-    def radiance(*direction):
+    def radiance(imported, *direction):
         interaction = mi.SurfaceInteraction3f()
         interaction.wi = -mi.Vector3f(*(np.array(direction) / np.linalg.norm(direction)).tolist())
-        return np.array(environment.eval(interaction)).max()
+        return np.array(imported.scene.environment().eval(interaction)).max()
 
-    assert radiance(0.8, 0.5, 0.3) > 1e3 > radiance(0, 1, 0.1) > 0.05
-    assert radiance(0, -1, 0.1) == 0
+    assert radiance(suns, 0.8, 0.5, 0.3) > 1e3 and radiance(suns, 0, 1, 0.1) == 0
+    assert radiance(skies, 0, 1, 0.1) > 0.05 and radiance(skies, 0, -1, 0.1) == 0
+    assert both.warnings == ("Mitsuba allows one environment: sky is kept, sun ignored",)
 
 
 def test_point_light_becomes_a_small_lamp(tmp_path):
@@ -314,7 +317,7 @@ def test_point_light_becomes_a_small_lamp(tmp_path):
         <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>
         <transform name="toWorld"><scale value="0.01"/></transform></shape>
         <emitter type="point"><point name="position" z="2"/><rgb name="intensity" value="8, 4, 2"/></emitter></scene>"""
-    scene = importer.load(write(tmp_path / "scene.xml", xml))
+    scene = load(write(tmp_path / "scene.xml", xml))
     np.testing.assert_allclose(seen(scene, [1, 0, 2], [0, 0, 0]), np.array([8, 4, 2]) / 4 / np.pi, rtol=0.02)
 
 
@@ -478,7 +481,7 @@ def test_list_survives_a_broken_description(tmp_path, monkeypatch, capsys):
     for name in ("good", "far"):
         write_yaml(tmp_path / f"{name}.yaml", **({"source": "far/scene.xml"} if name == "far" else {}))
     write(tmp_path / "broken.yaml", "camera: [1\n")
-    for module in ("nlt.paths", "nlt.scenes.catalog"):
+    for module in ("nlt.paths", "nlt.scenes.description"):
         monkeypatch.setattr(f"{module}.config_names", lambda kind: ["broken", "far", "good"])
     monkeypatch.setattr("nlt.scenes.description.find_config", lambda kind, name: tmp_path / f"{name}.yaml")
     assert main(["scenes", "list"]) == 0
@@ -562,7 +565,7 @@ GLTF = [
 
 
 def test_gltf_materials(tmp_path):
-    scene = importer.load(write_gltf(tmp_path / "quads.gltf", [m for m, _ in GLTF]))
+    scene = load(write_gltf(tmp_path / "quads.gltf", [m for m, _ in GLTF]))
     assert [material(s.bsdf()) for s in scene.shapes()] == [kind for _, kind in GLTF]
 
 
@@ -604,11 +607,11 @@ def test_glb_of_trimesh(tmp_path):
         box.visual = trimesh.visual.TextureVisuals(material=pbr)
         scene.add_geometry(box, node_name=name, transform=trimesh.transformations.translation_matrix([x, 0, 0]))
     (tmp_path / "chair.glb").write_bytes(scene.export(file_type="glb"))
-    shapes = {s.id(): s for s in importer.load(tmp_path / "chair.glb").shapes()}
+    shapes = {s.id(): s for s in load(tmp_path / "chair.glb").shapes()}
     assert set(shapes) == {"seat", "back"}
     np.testing.assert_allclose(np.array(shapes["back"].bbox().min).ravel(), [2.5, -1, -1.5])
     assert np.array(shapes["seat"].surface_area()).item() == pytest.approx(22)
-    np.testing.assert_allclose(under_white_sky(importer.load(tmp_path / "chair.glb")), [1, 0, 0], atol=0.01)
+    np.testing.assert_allclose(under_white_sky(load(tmp_path / "chair.glb")), [1, 0, 0], atol=0.01)
 
 
 def test_parts_of_a_mesh_have_the_same_names_every_time(tmp_path):
@@ -619,7 +622,7 @@ def test_parts_of_a_mesh_have_the_same_names_every_time(tmp_path):
     content["nodes"], content["scenes"] = content["nodes"][:1], [{"nodes": [0]}]
     path.write_text(json.dumps(content))
     for _ in range(3):
-        shapes = importer.load(path).shapes()
+        shapes = load(path).shapes()
         assert [s.id() for s in shapes] == ["quad_0", "quad_0_2"]
         radiances = [np.array(mi.traverse(s.emitter())["radiance.value"]).ravel() for s in shapes]
         np.testing.assert_allclose(radiances, [[1, 0, 0], [0, 1, 0]])
@@ -701,7 +704,7 @@ def test_obj_and_mtl(tmp_path):
 )  # fmt: skip
 def test_unreadable_models_are_refused(tmp_path, name, content, fragments):
     path = write(tmp_path / name, content)
-    refused(lambda: importer.load(path), path, *fragments)
+    refused(lambda: load(path), path, *fragments)
 
 
 def test_digest_covers_buffers_and_images(tmp_path):

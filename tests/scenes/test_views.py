@@ -48,7 +48,7 @@ def test_before_the_lens(tmp_path):
     scene = crowded(tmp_path)
     look = lambda x: Camera.look_at(np.array([x, 1, 0]), np.array([1, 1, 0]), np.array([0, 1, 0]), 70, 8, 8)
     shares = [Views(scene).shares(look(x)) for x in (0.95, 0.45)]
-    assert shares[0].near > 0.9 and shares[1].near == 0 and shares[0].back == shares[1].back == 0
+    assert shares[0]["near"] > 0.9 and shares[1]["near"] == 0 and shares[0]["back"] == shares[1]["back"] == 0
 
 
 def test_what_rays_meet(tmp_path):
@@ -58,10 +58,10 @@ def test_what_rays_meet(tmp_path):
     above = views.shares(Camera.look_at(np.array([0.5, 1.0, -0.5]), np.array([0, 0, 0.2]), up, 40, 8, 8))
     below = views.shares(Camera.look_at(np.array([0.5, -1.0, -0.5]), np.array([0, 0, 0.2]), up, 40, 8, 8))
     beside = views.shares(Camera.look_at(np.array([0.5, 1.0, -5.0]), np.array([0.5, 1.0, -9.0]), up, 40, 8, 8))
-    assert above.back == 0 and below.back > 0.9 and beside.nothing == 1
+    assert above["back"] == 0 and below["back"] > 0.9 and beside["nothing"] == 1
     # A 2 x 2 m floor 1 m below its middle fills a sixth of the sphere: it is the side of a cube.
     middle = views.shares(Camera.look_at(np.array([0, 1.0, 0]), np.array([0, 0, 0.01]), up, 40, 8, 8))
-    assert middle.nothing == pytest.approx(5 / 6, abs=0.05)
+    assert middle["nothing"] == pytest.approx(5 / 6, abs=0.05)
 
 
 def test_no_view_is_left(tmp_path):
