@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import torch
 
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.engines import Died
-from nlt.data.generate import generate
+from nlt.data.files import AnyPath
 from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation import live
@@ -45,19 +45,19 @@ _ROW = ("method", "seed", "train_images", "status", "message")  # columns of tra
 
 def compare(
     comparison: Comparison,
+    dataset: AnyPath,
     out: str | None = None,
     workers: int | None = None,
     scheduler: str = "local",
     slurm: Mapping[str, str] | None = None,
-    train_images: Sequence[int] = (),
     after_row: Callable[[Path], None] = lambda directory: None,
 ) -> Path:
     """Run a comparison, reusing what is already finished, and return the directory of its results.
 
     Args:
+        dataset: the directory that `nlt.data.generate.generate` returned.
         workers: number of trainings that run in parallel (default: one on this machine).
-        scheduler, slurm: as for `nlt.data.engines.find_engine`, for generation and training; the rest runs here.
-        train_images: also train every method on only the first N images of each scene, for each N given.
+        scheduler, slurm: as for `nlt.data.engines.find_engine`, for the trainings; the rest runs here.
         after_row: called with the directory after each row is written.
 
     Raises:
@@ -65,15 +65,11 @@ def compare(
     """
     start, provenance = time.time(), origin()
     directory, spec = Path(out or Path("results") / comparison.name), comparison.spec
-    for count in train_images:
-        if count > spec.train:
-            raise UserError(f"--train-images: {count} is more than data.dataset.train; give at most {spec.train}")
-    dataset = generate(spec, comparison.root, workers, scheduler, slurm)
     root = Path("runs") / dataset.name
     trainings = {
         (method, seed, count): Training.of(comparison, method, seed, root, count)
-        for count in (None, *sorted({*train_images} - {spec.train}))
-        for method, seed in comparison.jobs
+        for count in (None, *sorted({*comparison.train_images} - {spec.train}))
+        for method, seed in comparison.rows
         if method in comparison.trained
     }
     failures = train(list(trainings.values()), scheduler, workers, slurm or {})
@@ -84,11 +80,11 @@ def compare(
     frames = Frames(LightTransportDataset(dataset, spec, "test"))
     test, clock = Evaluation(frames, device, policy), Clock(frames, device, policy=policy)
     test.write_references(directory)
-    record = {**provenance, **surroundings(device, policy), **_describe(comparison, test, train_images)}
+    record = {**provenance, **surroundings(device, policy), **_describe(comparison, test)}
     runs: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
-    for number, (method, seed) in enumerate(comparison.jobs, 1):
-        print(f"\n[{number}/{len(comparison.jobs)}] {method}, seed {seed}", flush=True)
+    for number, (method, seed) in enumerate(comparison.rows, 1):
+        print(f"\n[{number}/{len(comparison.rows)}] {method}, seed {seed}", flush=True)
         run: dict[str, Any] = {"method": method, "seed": seed}
         with _record_failure(run):
             if method in comparison.untrained:
@@ -114,7 +110,7 @@ def compare(
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         after_row(directory)
     print("\n" + "\n".join([live.header(), *(live.row(run) for run in runs), live.floor(record["floor"])]))
-    if train_images and comparison.trained:
+    if comparison.train_images and comparison.trained:
         # The curve also has the trainings on all images.
         rows = [run | {"train_images": spec.train} for run in runs if run["method"] in comparison.trained]
         for (method, seed, images), training in trainings.items():
@@ -131,7 +127,7 @@ def compare(
     return directory
 
 
-def _describe(comparison: Comparison, test: Evaluation, train_images: Sequence[int]) -> dict[str, Any]:
+def _describe(comparison: Comparison, test: Evaluation) -> dict[str, Any]:
     """Return the manifest's entries on what is compared, on which data, and how accurate the references are."""
     floor, measured = test.floor()
     scenes = zip(measured.items(), references(test.directory, test.spec), strict=True)
@@ -147,7 +143,7 @@ def _describe(comparison: Comparison, test: Evaluation, train_images: Sequence[i
         "n_test": len(test),
         "shown": test.shown,
         "configs": comparison.configs,
-        "train_images": sorted(train_images),
+        "train_images": comparison.train_images,
         "floor": floor,
         "references": {scene: {**entry, "measured_mse": mse} for (scene, mse), entry in scenes},
     }

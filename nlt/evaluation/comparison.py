@@ -68,6 +68,7 @@ class Comparison:
         spec, root: the dataset and the directory of datasets.
         files: the config files of each method, later ones overriding earlier ones. `variant` changes every trained
             method; METHOD@VARIANT applies a further config of configs/variant to a single method.
+        train_images: every method is also trained on only the first N images of each scene, for each N.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Comparison:
     variant: str | None = None
     table: str | None = None
     precision: str = "auto"
+    train_images: tuple[int, ...] = ()
 
     @classmethod
     def load(
@@ -89,6 +91,7 @@ class Comparison:
         methods: list[str] | None,
         seeds: int = 1,
         precision: str = "auto",
+        train_images: Collection[int] = (),
     ) -> Comparison:
         """Read a config by name or path; the other arguments override it.
 
@@ -108,13 +111,19 @@ class Comparison:
         spec, root = load_spec([str(data_file), str(scale_file)])
         if not spec.test:
             raise UserError(f"{scale_file}: data.dataset.test: must be at least 1 for a comparison, is 0")
+        if train_images and max(train_images) > spec.train:
+            most = f"{max(train_images)} is more than data.dataset.train"
+            raise UserError(f"--train-images: {most}; give at most {spec.train}")
         files = {}
         for method in sorted(content.methods or all_methods(), key=order):
             model, _, own_variant = method.partition("@")
             variants = [find_config("variant", name) for name in (content.variant, own_variant) if name]
             files[method] = [data_file, find_config("model", model), scale_file, *variants]
         seed_list = list(range(content.seed, content.seed + seeds))
-        found = cls(full_name, spec, root, files, seed_list, scale_file, content.variant, content.table, precision)
+        found = cls(
+            full_name, spec, root, files, seed_list, scale_file, content.variant, content.table, precision,
+            tuple(sorted(train_images)),
+        )  # fmt: skip
         for method in found.trained:
             check_configs([str(path) for path in files[method]])
         return found
@@ -141,7 +150,7 @@ class Comparison:
         return [method for method in self.methods if method not in self.untrained]
 
     @property
-    def jobs(self) -> list[tuple[str, int]]:
+    def rows(self) -> list[tuple[str, int]]:
         """The rows of the comparison as (method, seed); methods without training have one seed."""
         return [(m, seed) for m in self.methods for seed in (self.seeds[:1] if m in self.untrained else self.seeds)]
 

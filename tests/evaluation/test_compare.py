@@ -875,4 +875,4 @@ def test_every_comparison_names_what_there_is(name):
     if found.table:
         assert {m for m in paths.config_names("model") if published(found.table, m)} <= set(found.methods)
     trained = [method for method in found.methods if comparison.build_if_untrained(method) is None]
-    assert len(found.jobs) == 3 * len(trained) + len(found.methods) - len(trained)
+    assert len(found.rows) == 3 * len(trained) + len(found.methods) - len(trained)
