@@ -26,6 +26,14 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
+def known(kind: str, name: str) -> str:
+    """Return a name or path in configs/`kind` if there is such a config, for pydantic's validators."""
+    names = paths.config_names(kind)
+    if name not in names and not paths.find_config(kind, name).is_file():
+        raise ValueError(f"no {kind} {name!r}; known are {', '.join(names)}")
+    return name
+
+
 def read_configs(files: Sequence[str | Path]) -> dict[str, Any]:
     """Merge YAML configs, given by path or by name, for example "data/demo"; later ones override earlier ones.
 

@@ -15,11 +15,11 @@ from nlt.data.engines import Died
 from nlt.data.files import AnyPath
 from nlt.data.store import references
 from nlt.errors import DivergedError, UserError
-from nlt.evaluation import live
 from nlt.evaluation.clock import Clock
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
+from nlt.evaluation.paper import COLUMNS, FLOOR, label
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import (
     DIVERGED,
@@ -35,11 +35,12 @@ from nlt.evaluation.results import (
     write_timings,
 )
 from nlt.evaluation.trainings import Training, train
-from nlt.metrics.quantities import METRICS
+from nlt.metrics.quantities import METRICS, heading, text
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
 
 JUDGED = "judged.npz"  # the cached evaluation in a run's directory
+_HEADINGS = f"{'method':22}" + "".join(f"{heading(key):>18}" for key in COLUMNS)
 _ROW = ("method", "seed", "train_images", "status", "message")  # columns of training_images.csv before its metrics
 
 
@@ -102,14 +103,15 @@ def compare(
                 write_images(directory, method, radiance=radiance)
         runs.append(run)
         if number == 1:
-            print(live.header())
-        print(live.row(run), flush=True)
+            print(_HEADINGS)
+        print(_line(run), flush=True)
         write_rows(directory / RUNS, runs)
         write_timings(directory, record, runs)
         write_rows(directory / VIEWS, views)
         write_manifest(directory, record | {"wall_time_s": round(time.time() - start, 1)})
         after_row(directory)
-    print("\n" + "\n".join([live.header(), *(live.row(run) for run in runs), live.floor(record["floor"])]))
+    floor = {"method": FLOOR, "status": OK, **record["floor"]}
+    print("\n" + "\n".join([_HEADINGS, *(_line(run) for run in (*runs, floor))]))
     if comparison.train_images and comparison.trained:
         # The curve also has the trainings on all images.
         rows = [run | {"train_images": spec.train} for run in runs if run["method"] in comparison.trained]
@@ -177,6 +179,13 @@ def _load_trained(
     if training in failures:
         raise Died(failures[training])
     return training.load(device)
+
+
+def _line(run: Mapping[str, Any]) -> str:
+    """Return the line of a run that is printed while the comparison runs."""
+    if run["status"] != OK:
+        return f"{label(run['method']):22} {run['status']}: {run['message']}"
+    return f"{label(run['method']):22}" + "".join(f"{text(key, run.get(key)):>18}" for key in COLUMNS)
 
 
 def _history(training: Training) -> list[dict[str, Any]]:

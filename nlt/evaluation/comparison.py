@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import NonNegativeInt, field_validator
+from pydantic import AfterValidator, NonNegativeInt
 
-from nlt.config import Settings, parse, read_configs
+from nlt.config import Settings, known, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
@@ -22,41 +22,20 @@ from nlt.paths import config_names, find_config
 from nlt.training import check_configs
 
 
+def _known_method(method: str) -> str:
+    model, *variants = method.split("@", 1)
+    return "@".join([known("model", model), *(known("variant", variant) for variant in variants)])
+
+
 class _Content(Settings):
     """The content of a config of configs/compare."""
 
-    table: str | None = None
+    table: Literal[*tables()] | None = None  # type: ignore[valid-type]
     data: str
     scale: str
-    variant: str | None = None
-    methods: list[str] | None = None
+    variant: Annotated[str, AfterValidator(partial(known, "variant"))] | None = None
+    methods: list[Annotated[str, AfterValidator(_known_method)]] | None = None
     seed: NonNegativeInt = 0
-
-    @field_validator("table")
-    @classmethod
-    def _known_table(cls, table: str | None) -> str | None:
-        return _known("table", table, tables())
-
-    @field_validator("variant")
-    @classmethod
-    def _known_variant(cls, variant: str | None) -> str | None:
-        return _known("variant", variant, config_names("variant"))
-
-    @field_validator("methods")
-    @classmethod
-    def _known_methods(cls, methods: list[str] | None) -> list[str] | None:
-        for method in methods or ():
-            name, *variants = method.split("@", 1)
-            _known("method", name, config_names("model"))
-            for variant in variants:
-                _known("variant", variant, config_names("variant"))
-        return methods
-
-
-def _known(kind: str, name: str | None, names: Collection[str]) -> str | None:
-    if name is not None and name not in names:
-        raise ValueError(f"no {kind} {name!r}; known are {', '.join(names)}")
-    return name
 
 
 @dataclass

@@ -15,6 +15,10 @@ def paper() -> dict[str, Any]:
     return yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text())
 
 
+COLUMNS = tuple(paper()["columns"])  # columns of the paper's tables, in its order
+FLOOR = "reference (its halves)"  # the row that judges one half of the reference against the other
+
+
 def tables() -> tuple[str, ...]:
     """Return the names of the paper's tables."""
     return tuple(name for name, content in paper().items() if "title" in content)

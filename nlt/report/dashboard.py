@@ -19,8 +19,7 @@ from tensorboard.plugins.hparams import summary_v2 as hp  # hparams.api would im
 from torch.utils.tensorboard import SummaryWriter
 
 from nlt.errors import UserError
-from nlt.evaluation.live import COLUMNS
-from nlt.evaluation.paper import label
+from nlt.evaluation.paper import COLUMNS, label
 from nlt.evaluation.results import OK, Results, load
 from nlt.metrics.quantities import METRICS, heading
 

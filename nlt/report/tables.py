@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from nlt.evaluation.live import COLUMNS, FLOOR
-from nlt.evaluation.paper import label, paper, published
+from nlt.evaluation.paper import COLUMNS, FLOOR, label, paper, published
 from nlt.evaluation.results import OK, Results, write_rows
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 from nlt.report.table_writer import Table, write_texts

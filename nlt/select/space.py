@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, PositiveInt, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, field_validator
 from scipy.stats.qmc import Halton
 
-from nlt.config import Settings, merge, parse, read_configs
+from nlt.config import Settings, known, merge, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
 from nlt.models.factory import build, method_class
 from nlt.models.module import RenderingModule
-from nlt.paths import config_names, find_config
+from nlt.paths import find_config
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class SearchSpace(Settings):
     name: str
     data: str
     scale: str
-    methods: tuple[str, ...] = Field(min_length=1)
-    sizes: tuple[str, ...] = Field(min_length=1)
+    methods: tuple[Annotated[str, AfterValidator(partial(known, "model"))], ...] = Field(min_length=1)
+    sizes: tuple[Annotated[str, AfterValidator(partial(known, "variant"))], ...] = Field(min_length=1)
     point_counts: tuple[PositiveInt, ...] = Field(min_length=1)
     photon_counts: tuple[PositiveInt, ...] = Field(min_length=1)
     minutes: PositiveFloat
@@ -61,18 +61,10 @@ class SearchSpace(Settings):
 
     @field_validator("methods", "sizes", "point_counts", "photon_counts")
     @classmethod
-    def _valid(cls, values: tuple, field: ValidationInfo) -> tuple:
-        """Return the values, numbers sorted; there is a config for each name, and no value twice."""
+    def _unique(cls, values: tuple) -> tuple:
         if len(set(values)) < len(values):
             raise ValueError(f"must not have duplicates, is {list(values)}")
-        kind = {"methods": "model", "sizes": "variant"}.get(field.field_name or "")
-        if kind is None:
-            return tuple(sorted(values))
-        known = config_names(kind)
-        for name in values:
-            if name not in known and not find_config(kind, name).is_file():
-                raise ValueError(f"no {name!r} in configs/{kind}; known are {', '.join(known)}")
-        return values
+        return values if isinstance(values[0], str) else tuple(sorted(values))
 
     @classmethod
     def load(cls, config: str, minutes: float | None = None) -> SearchSpace:

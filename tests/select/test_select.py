@@ -415,7 +415,7 @@ def test_budget(space, monkeypatch, capsys, slower):
     ("change", "said"),
     [
         ({"method": ["cnn"]}, "method: unknown key"),
-        ({"methods": ["cnm"]}, "methods: no 'cnm'"),
+        ({"methods": ["cnm"]}, "methods.0: no model 'cnm'"),
         ({"methods": []}, "methods: must be a list of at least 1"),
         ({"methods": ["oidn_1"]}, "methods: oidn_1 is not trained"),
         ({"point_counts": [65]}, "point_counts: 65 is more than the 64"),
