@@ -1,7 +1,5 @@
 """The command line, `nlt`. This module only parses arguments; each subcommand imports its heavy modules itself."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Config files: read, merged, and checked against a class with pydantic. Every error is one line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from functools import reduce

@@ -1,7 +1,5 @@
 """The display transform from linear radiance to the sRGB values that are shown and compared."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Training and evaluation through LightningCLI: `nlt fit|validate|test|predict`."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import re

@@ -5,8 +5,6 @@ waits slows down the others: with the passive policy, a frame at 64x64 takes two
 not share its cores and is faster with spinning threads (docs/performance.md).
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

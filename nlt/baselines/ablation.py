@@ -1,7 +1,5 @@
 """The static ablation: the U-Net with any combination of four inputs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

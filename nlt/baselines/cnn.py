@@ -1,7 +1,5 @@
 """Baseline "CNN only": the U-Net sees only the G-buffer."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from torch import Tensor

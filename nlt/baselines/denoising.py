@@ -1,7 +1,5 @@
 """Baseline "Denoising": the U-Net sees path-traced radiance in a random subset of the pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Baseline "Feature Projection": learned point features are projected without light transport."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from nlt.models.clouds import CloudMethod

@@ -1,7 +1,5 @@
 """Methods that we do not train: path tracing, alone or denoised by Intel Open Image Denoise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 

@@ -1,7 +1,5 @@
 """Photon splat, not in the paper: the photons' irradiance in each pixel feeds the U-Net, without a 3D network."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

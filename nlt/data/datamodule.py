@@ -1,7 +1,5 @@
 """The DataModule of every method: batches of samples from one or several scenes."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import deque
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Datasets that return samples as tensors, and their samplers. Rendering processes import this, so keep it light."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from typing import Any
 

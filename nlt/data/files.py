@@ -1,7 +1,5 @@
 """Files of a dataset, local or at any fsspec URL: written atomically, and read through a local cache."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib

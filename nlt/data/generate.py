@@ -1,7 +1,5 @@
 """Dataset generation: short-lived processes, local or on a cluster, render the shards that do not exist yet."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Training samples rendered during training. Each is used for one step only, so no noise is seen twice."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

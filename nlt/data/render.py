@@ -1,7 +1,5 @@
 """Rendering of a dataset's samples, one at a time, each from its own seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 import drjit as dr

@@ -11,8 +11,6 @@ Only photons that arrive in the room are stored: if the scene has a `room`, they
 surface. Most photons of a sky do not, so photons are emitted until P have arrived or a limit on emissions is reached.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`nlt data stats`: the cost of a sample by field, and the estimated cost of the paper's dataset on this machine."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`nlt data verify`: reads every byte of a dataset and reports everything that is wrong with it."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The paper's claims (claims.yaml), judged on stored results: each holds, does not hold or is undecided."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The cost of a frame: time per stage at batch 1, floating-point operations, memory."""
 
-from __future__ import annotations
-
 import math
 import time
 import weakref

@@ -1,7 +1,5 @@
 """`nlt compare`: generate data, train, evaluate and time all methods, and write the results behind the tables."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The evaluation loop: every image that a method is judged by is made and measured here."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """`nlt export`: a trained method as a program that needs only PyTorch, or its weights as safetensors."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """Samples of a dataset that can be rendered again, for the clock and for methods that path trace."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Evaluation of a method's images of the test split by one set of metrics."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """The paper's published numbers and its names for the methods."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

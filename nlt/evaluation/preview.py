@@ -1,7 +1,5 @@
 """`nlt scenes preview`: a contact sheet of scenes in random states, from random views."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

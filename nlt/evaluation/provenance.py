@@ -1,7 +1,5 @@
 """The provenance of results: command, commit, device, versions."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

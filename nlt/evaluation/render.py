@@ -1,7 +1,5 @@
 """`nlt render`: videos rendered by a trained method, next to path tracing."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Metrics of a predicted image against its two reference halves; `METRICS` in quantities.py describes them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import flip_evaluator

@@ -1,7 +1,5 @@
 """The Inception network of the FID in plain PyTorch, the search for its weights, and a disk cache of its features."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import importlib.util

@@ -1,7 +1,5 @@
 """The Fréchet distance and the kernel distance of two sets of images, and their jackknife values."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """All quantities that are measured: name, direction, unit and print format. This module imports nothing heavy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

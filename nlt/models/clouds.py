@@ -1,7 +1,5 @@
 """The base class of methods that use clouds: surface points, photons or both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

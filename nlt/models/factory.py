@@ -1,7 +1,5 @@
 """From configs and checkpoints to methods."""
 
-from __future__ import annotations
-
 import inspect
 import pydoc
 from collections.abc import Mapping

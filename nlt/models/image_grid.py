@@ -1,7 +1,5 @@
 """TensorBoard images during training: noisy target, prediction, reference and error of a few samples."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import lightning as L

@@ -1,7 +1,5 @@
 """Training losses against a noisy target; each is unbiased in the sense of the paper's Lemma 1."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from nlt.display import expose

@@ -1,7 +1,5 @@
 """The interface that the comparison needs of a method, trained or not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

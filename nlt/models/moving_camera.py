@@ -1,7 +1,5 @@
 """Further views of a scene state, without recomputing what does not depend on the camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """The paper's method: light transport on points and optionally photons, projection and image synthesis."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

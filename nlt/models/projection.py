@@ -1,7 +1,5 @@
 """The 3D-to-2D projection, Eq. (1): the mean of the features of all visible points that fall into a pixel."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

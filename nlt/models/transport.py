@@ -1,7 +1,5 @@
 """The Light Transport Layer: embedding and PointNet for points, a fully connected ResNet for photons."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

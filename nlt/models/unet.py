@@ -1,7 +1,5 @@
 """The Image Synthesis Layer: a U-Net of convolutional ResNet blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -3,8 +3,6 @@
 All results are numpy arrays in metres, world coordinates and linear, unclamped RGB.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Choose the Mitsuba variant: cuda, else llvm, else scalar. Each is tried once, in a separate process."""
 
-from __future__ import annotations
-
 import ctypes.util
 import functools
 import glob

@@ -4,8 +4,6 @@ The log directory DIR/tensorboard is rebuilt from the results; curves and image 
 logs, where these still exist. No histograms are logged.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """`nlt report DIR`: tables, figures and report.html from stored results; the same results give the same bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Charts of a comparison, drawn from its stored results: accuracy over time per frame, and along the trainings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -4,8 +4,6 @@ A value x, radiance × exposure, becomes the integer steps · asinh(x / SMALLEST
 logarithmic above. The picture holds these integers without loss: the high bytes in its upper half, the low bytes below.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """report.html: tables, charts and images of a comparison in one file that opens from disk and loads no others."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """`nlt data show`: a figure of one sample of a dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

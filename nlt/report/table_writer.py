@@ -1,7 +1,5 @@
 """Tables of text, written as Markdown and LaTeX."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

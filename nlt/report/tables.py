@@ -1,7 +1,5 @@
 """The tables of a comparison, made from stored results: CSV, Markdown and LaTeX."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ The static part and each movable object are shape groups with their own accelera
 transforms of their instances. Emitting shapes cannot be instanced and stay plain meshes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

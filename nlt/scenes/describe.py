@@ -1,7 +1,5 @@
 """`nlt scenes show`, `check` and `add`: summarise a scene, and write a first description of a new scene."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

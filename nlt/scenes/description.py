@@ -4,8 +4,6 @@ Lengths in the file are in scene units, so that they can be read off the scene's
 else in nlt, they are in metres.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Load any scene file as a Mitsuba scene of triangle meshes, one per shape, each with a unique, reproducible id."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 import xml.etree.ElementTree as ET

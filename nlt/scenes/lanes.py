@@ -1,7 +1,5 @@
 """Run one kernel in any variant: vectorised in Mitsuba's JIT variants, in a Python loop in the scalar variant."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Opacity masks: rays pass through the transparent parts of a surface, like the gaps between leaves drawn on a quad."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

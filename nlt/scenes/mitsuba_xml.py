@@ -5,8 +5,6 @@ textures, lights and shapes that Mitsuba 3 refuses. It drops media, which nlt do
 films and samplers, because nlt has its own. Materials that Mitsuba 3 does not have are left for it to refuse.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import re

@@ -1,7 +1,5 @@
 """The static point cloud of a scene (supplementary, Point Cloud Sampling) and its attributes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

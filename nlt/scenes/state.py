@@ -1,7 +1,5 @@
 """Sample states and views of a scene as in the supplementary (Scene Modification, View Sampling)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The states and cameras of the frames of a video, from a few keyframes or a turntable."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

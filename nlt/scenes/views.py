@@ -1,7 +1,5 @@
 """Sample views that show the room: not from behind a wall, from inside a closed object or with a blocked lens."""
 
-from __future__ import annotations
-
 import zlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Advice on what a model needs, from what varies in a scene and an experiment; nothing is trained."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence

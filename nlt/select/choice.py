@@ -4,8 +4,6 @@ Errors are (S, N) arrays of training seeds by validation images, with the same i
 candidates. Lower is better, so MSSIM is given as 1 - MSSIM.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 

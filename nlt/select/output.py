@@ -1,7 +1,5 @@
 """The output of a selection: its table, and the front of accuracy against time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

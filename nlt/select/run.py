@@ -1,7 +1,5 @@
 """`nlt select`: the smallest model that a scene needs, from what varies in the scene and from short trainings."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from dataclasses import asdict

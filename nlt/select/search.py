@@ -5,8 +5,6 @@ and the scores after each round. Every decision follows from these files, so a s
 the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -5,8 +5,6 @@ knows are updated: position, albedo, material and emission. The points of a repl
 by area. Every other point of the moving light moves to the second light.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

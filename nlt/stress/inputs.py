@@ -1,7 +1,5 @@
 """Stress changes that need no rendering: fewer inputs, or another coordinate frame of the world."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The stress suites' changes of a test view's light, state and camera, in an unchanged scene."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any

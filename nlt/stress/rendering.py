@@ -1,7 +1,5 @@
 """Rendering of the stress suites of a dataset, in a file per ladder, severity and scene."""
 
-from __future__ import annotations
-
 import os
 import sys
 import zlib

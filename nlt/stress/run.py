@@ -5,8 +5,6 @@ includes the manifest of the suites; and, outside git, `images/SUITE-METHOD.npz`
 severities. nlt/stress/report.py makes everything else there from these.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Mapping

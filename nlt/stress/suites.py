@@ -1,7 +1,5 @@
 """The stress suites of a manifest in configs/stress: ladders of changes, each at severities 1 to 5."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

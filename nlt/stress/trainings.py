@@ -1,7 +1,5 @@
 """The stress suite "training": short trainings with other seeds, learning rates, precision or corrupted samples."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The views of the stress suites as batches, and the evaluation of methods on them."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
