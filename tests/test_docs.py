@@ -17,7 +17,7 @@ STUDIES = ("results/sizes/leanest.md",)
 
 
 def anchors(page):
-    """Of a page's headings, as they are linked."""
+    """Return the anchors of a page's headings."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

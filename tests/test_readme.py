@@ -69,7 +69,7 @@ def blocks(page, language):
 
 
 def commands(page):
-    """Of the shell blocks, a line each without comments, and of the README also those within a line."""
+    """Return the lines of the shell blocks without comments; for the README also commands within a line."""
     lines = "".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
     inline = re.findall(r"`(nlt \w+ [^`]+)`", page.read_text()) if page == README else []
     return list(
@@ -105,7 +105,7 @@ def sandbox(tmp_path_factory):
 def test_every_command_is_covered():
     covered = [*RUN, *ELSEWHERE]
     found = commands(README) + commands(CONTRIBUTING)
-    assert set(found) == set(covered), "a command belongs into RUN, or into ELSEWHERE beside the test that runs it"
+    assert set(found) == set(covered), "add the command to RUN, or to ELSEWHERE with the test that runs it"
     for command, test in ELSEWHERE.items():
         file, name = test.split("::")
         assert f"def {name}(" in next((PROJECT / "tests").rglob(file)).read_text(), command

@@ -72,7 +72,7 @@ class Progress(L.Callback):
         if trainer.is_global_zero:
             write_bytes(self._file, json.dumps({**state, "loss": float(loss)}).encode())
 
-    def died(self, error: Exception) -> None:
+    def record_error(self, error: Exception) -> None:
         """Write the error that ended the training."""
         message = " ".join(f"{type(error).__name__}: {error}".split())
         write_bytes(self._file, json.dumps({"state": _DIED, "message": message}).encode())

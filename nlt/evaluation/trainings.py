@@ -144,7 +144,7 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
         except OSError as error:
             raise to_user_error(error) from None
         except Exception as error:
-            progress.died(error)
+            progress.record_error(error)
             raise
         write_bytes(run / DONE, json.dumps({**outcome, "history": progress.history}).encode())
 

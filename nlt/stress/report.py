@@ -243,7 +243,7 @@ def _trainings(stressed: Stressed) -> Table:
         cells[-1] += [_number(row["error"]) if row["status"] == OK else row["status"] for row in outcomes]
     content = stressed.manifest["manifest"]["training"]
     note = (
-        f"Trained anew for {content['share']:.0%} of the steps: the error over {content['seeds']} seeds "
+        f"Trained again for {content['share']:.0%} of the steps: the error over {content['seeds']} seeds "
         "(mean ± standard deviation), and that of one seed with a change."
     )
     return Table("Training", note, ["seeds", *(f"{a} {b}" for a, b in kinds)], cells)

@@ -126,7 +126,7 @@ class World(SimpleNamespace):
         found = self.folder.glob(f"runs/*/{method}-" + "[0-9a-f]" * 8)
         return max(found, key=lambda path: path.stat().st_mtime)
 
-    def took(self, method):
+    def outcome(self, method):
         return json.loads((self.run(method) / "done.json").read_text())
 
     def checkpoint(self, method):
@@ -412,7 +412,7 @@ def test_a_killed_training_goes_on(world, more_methods):
     """In the same comparison, from its last whole checkpoint: what comes out is as if nothing had been."""
     more_methods("KilledOnce")
     row = world.compare("--methods", "killedonce")["killedonce"]
-    assert (world.folder / "killed").exists() and world.took("killedonce")["resumed"]
+    assert (world.folder / "killed").exists() and world.outcome("killedonce")["resumed"]
     assert row["status"] == "ok" and row["mse"] == world.rows["nlt"]["mse"]
     assert same_weights(world.run("killedonce"), world.run("nlt"))
 
@@ -426,7 +426,7 @@ def test_a_lost_mark_costs_no_step(world, trainings):
     """Killed between the last checkpoint and done.json: the training is found finished."""
     (world.run("cnn") / "done.json").unlink()
     row = world.compare("--methods", "cnn")["cnn"]
-    assert len(trainings) == 1 and world.took("cnn")["resumed"]
+    assert len(trainings) == 1 and world.outcome("cnn")["resumed"]
     assert row["mse"] == world.rows["cnn"]["mse"]
 
 
@@ -547,7 +547,7 @@ def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
 
 
 def test_what_is_judged_is_kept(world, monkeypatch):
-    """For the same commit, so that a killed comparison goes on; times are taken anew."""
+    """At the same commit, evaluations are kept, so that a killed comparison resumes; times are measured again."""
     for kept in world.folder.glob("runs/**/judged.npz"):
         kept.unlink()
     judged, original = [], Evaluation.evaluate
@@ -597,11 +597,11 @@ def test_history(world, more_methods):
                 for event in log.Scalars(f"val/{key}")
             ]
             assert [float(row[key]) for row in mine] == pytest.approx(logged)
-        assert 0 < float(mine[0]["train_s"]) < world.took(method)["train_s"]
+        assert 0 < float(mine[0]["train_s"]) < world.outcome(method)["train_s"]
 
 
 def test_training_images(world, trainings, capfd):
-    """Trained on fewer, as long; beside what the table's own training saw."""
+    """Trainings on fewer images take as many steps; the full training's row is listed with them."""
     world.compare("--methods", "cnn", "path_tracing_1", "--train-images", "3", "8", out="fewer")
     assert [(job.method, job.train_images) for job in trainings] == [("cnn", 3)]
     rows = load(world.folder / "fewer").rows("training_images.csv")
@@ -708,7 +708,7 @@ def test_traced_pixels_are_no_stored_ones(world):
 
 
 def test_sizes(world):
-    """Of a network small enough to count by hand: parameters, FLOPs, memory."""
+    """Parameters, FLOPs and memory agree with a count by hand for a small network."""
 
     class OneConvolution(CNN):
         def synthesize(self, batch, features):
@@ -727,15 +727,15 @@ def test_sizes(world):
 
 
 def test_dashboard(world):
-    """Each training's own curves and grids, as links, beside its final metrics; Lightning's hyperparameters are off."""
+    """Each training has its curves, image grids and final metrics; Lightning's hyperparameters are off."""
     logs = write_logs(load("out"))
     assert {path.parent.relative_to(logs).as_posix() for path in logs.glob("**/seed_3")} == set(world.rows)
     # A link for each time that the training was begun or went on.
     links = [path for path in (logs / "cnn/seed_3").iterdir() if path.is_symlink()]
     tags = [EventAccumulator(str(link)).Reload().Tags() for link in links]
-    scalars, images = ({tag for each in tags for tag in each[kind]} for kind in ("scalars", "images"))
+    scalars, images = ({tag for run in tags for tag in run[kind]} for kind in ("scalars", "images"))
     assert {"train/loss", "val/loss", "val/mse"} <= scalars and images == {"val/images"}
-    assert "hp_metric" not in scalars and not any(each["histograms"] for each in tags)
+    assert "hp_metric" not in scalars and not any(run["histograms"] for run in tags)
     assert not any(path.is_symlink() for path in (logs / "oidn_1/seed_3").iterdir())
 
 

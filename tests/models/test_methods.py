@@ -346,7 +346,7 @@ def test_resuming_is_exact(tmp_path, config):
 
 
 def test_a_moving_camera_reuses_the_state(method):
-    """The same image to the bit, light transport computed once for a state, anew for another one."""
+    """The image is the same to the bit; light transport is computed once per state."""
     moving, (here, there) = MovingCamera(method), (synthetic_batch(seed=seed) for seed in (0, 1))
     there |= {name: here[name] for name in method.state_inputs}
     calls, transport = [], method.transport

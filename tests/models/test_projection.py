@@ -40,7 +40,7 @@ def scene(batch=2, points=2000, channels=5):
 
 
 def occluded_share(depth, normal, matrix, view, x, y, z, epsilon):
-    """Of the four nearest pixel centres, the border repeated, by bilinear weight: whose plane lies before z."""
+    """Return the bilinear weight of the four nearest pixels whose plane lies before z; the border is repeated."""
     i, j = math.floor(x - 0.5), math.floor(y - 0.5)
     total = 0.0
     for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1)):

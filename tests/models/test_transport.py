@@ -54,7 +54,7 @@ def test_permutation_equivariance():
 
 
 def test_no_visible_point():
-    """Finite, with finite gradients, and the sample beside it is not disturbed."""
+    """Output and gradients are finite, and the other sample of the batch is not disturbed."""
     net, points, visible = network()
     expected = net(points, visible)[1]
     visible[0] = False

@@ -42,7 +42,7 @@ def footprints(view, camera, buffer):
 
 
 def check(renderer, resolution, free, state_of):
-    """Of the points that the camera sees: the share that the projection keeps, and that of the hidden it lets through.
+    """Return the share of visible points that the projection keeps and of hidden points that it lets through.
 
     `free(state, origin, points)` (n,) bool says independently of depth maps which points the origin sees.
     """

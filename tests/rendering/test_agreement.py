@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 # ---- photons --------------------------------------------------------------------------------------------
 
 SKY = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32) ** 4 * 20
-# Patches: centre, half width, normal, way to another patch. The second lies beside the crate, partly in its shadow.
+# Patches: centre, half width, normal, way to another patch. The second lies next to the crate, partly in its shadow.
 WALL = ([1, 0.7, 0.1], 0.4, [-1, 0, 0], [0, -0.3, 0])
 FLOOR = ([0, 0, 0.2], 0.2, [0, 1, 0], [-0.3, 0, 0])
 
@@ -50,7 +50,7 @@ def compatible(ours, theirs):
 
 @pytest.mark.parametrize("case", ["area light", "environment", "both"])
 def test_irradiance(tmp_path, case):
-    """Photons give a patch of a wall, or of the floor beside the crate, its direct irradiance."""
+    """Photons give a patch of a wall, or of the floor next to the crate, its direct irradiance."""
     file = write_room(tmp_path, is_open=case != "area light", light=case != "environment")
     if case != "area light":
         mi.Bitmap(SKY).write(str(tmp_path / "sky.exr"))
@@ -94,7 +94,7 @@ def test_photon_splat(tmp_path):
         images = np.stack([np.moveaxis(np.array(render(k)), 2, 0) for k in range(8)]).astype(float)
         return images * np.pi / albedo[:, None, None]
 
-    # Where no pixel beside it sees another surface, and which is no lamp.
+    # Pixels whose neighbours see the same surface, which is no lamp.
     normal, emits = buffer["normal"], mitsubas(1).any((0, 1))
     flat = ~ndimage.maximum_filter(emits, 3)
     for channel in normal:

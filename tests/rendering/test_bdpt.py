@@ -221,8 +221,8 @@ def test_states_and_pixels(renderer, demo):
 def test_choosing(tmp_path, monkeypatch, caplog):
     """The dataset overrules the scene; where only `path` can run, only the scene's choice gives way."""
     scene = str(write_yaml(tmp_path / "scene.yaml", integrator="bdpt"))
-    of = lambda **more: SampleRenderer(DatasetSpec([scene], "fixed_lights", **more), 0).renderer.integrator_name
-    assert (of(), of(integrator="path"), of(integrator="bdpt")) == ("bdpt", "path", "bdpt")
+    chosen = lambda **more: SampleRenderer(DatasetSpec([scene], "fixed_lights", **more), 0).renderer.integrator_name
+    assert (chosen(), chosen(integrator="path"), chosen(integrator="bdpt")) == ("bdpt", "path", "bdpt")
     with pytest.raises(UserError, match=r"data\.dataset\.integrator: must be one of scene, path, bdpt, is 'photons'"):
         DatasetSpec([scene], integrator="photons")
     described = Scene(load_description(scene), "fixed_lights")

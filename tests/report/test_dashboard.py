@@ -76,7 +76,7 @@ def test_tensorboard_shows_it(stored):
 
 
 def test_again(stored, monkeypatch):
-    """Made anew, nothing is left of before; the trainings' own logs stay."""
+    """Making it again replaces everything; the trainings' own logs stay."""
     monkeypatch.chdir(stored.parent)
     for _ in range(2):
         logs = write_logs(load(stored))

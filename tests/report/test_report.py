@@ -178,7 +178,7 @@ def test_times_by_device(stored):
 
 
 def test_times_of_another_training_are_not_shown(stored, tmp_path):
-    """A method that was trained anew was not timed on the other device; results without the file know one device."""
+    """A method that was trained again was not timed on the other device; results without the file know one device."""
     for path in stored.glob("*.[cj]s*"):
         shutil.copy(path, tmp_path)
     rows = [{**row, "run": "runs/another"} for row in load(tmp_path).timings]

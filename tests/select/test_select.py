@@ -99,7 +99,7 @@ def test_advice_of_several_scenes():
     assert direction.verdict == "needed" and "mirror 25" in direction.reason
     assert advice.advise(spec, some[:1])[1].verdict.startswith("not needed")
     text = advice.table(advice.advise(spec, some), some)
-    assert all(each.reason in text for each in advice.advise(spec, some))
+    assert all(item.reason in text for item in advice.advise(spec, some))
 
 
 def test_occupancy():
@@ -110,7 +110,7 @@ def test_occupancy():
     curve = advice.occupancy(pixels, surface, 4096)
     for n in (128, 512, 4096):
         drawn = [rng.choice(pixels, n, replace=False) for _ in range(400)]
-        shares = [np.isin(np.flatnonzero(surface), each).mean() for each in drawn]
+        shares = [np.isin(np.flatnonzero(surface), subset).mean() for subset in drawn]
         assert np.isclose(curve[n], np.mean(shares), atol=0.01)
     assert advice.occupancy(pixels, np.zeros(32, bool), 4096)[128] == 0
 
@@ -330,7 +330,7 @@ def test_end_to_end(space, tiny, monkeypatch, capsys):
     assert config["trainer"]["max_steps"] == STEPS
     module = RenderingModule.load_from_checkpoint(next(Path("again").rglob("*.ckpt")))
     assert sum(p.numel() for p in module.parameters()) == int(chosen["parameters"])
-    # Confirmed on the test split, by metrics computed anew.
+    # Confirmed on the test split, by metrics computed here.
     confirmed = {row["role"]: row for row in table("out", "confirmed")}
     assert set(confirmed) == {"chosen", "full model", "best", "by parameters"}
     assert float(confirmed["full model"]["mssim_worse"]) == 0

@@ -255,7 +255,7 @@ def test_breaking_point(growth, point):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Made-up rows beside made-up results of a comparison, drawn; one pixel of the CNN is not finite."""
+    """Made-up stress rows and results of a comparison are drawn; one pixel of the CNN is not finite."""
     directory = tmp_path_factory.mktemp("made")
     names = ("cnn", "nlt", "denoising_1_4")
     numbers = papers_numbers("table2")
