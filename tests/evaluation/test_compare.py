@@ -8,7 +8,6 @@ import shutil
 import statistics
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -542,7 +541,9 @@ def test_progress_of_trainings(tmp_path, capsys, monkeypatch):
         ("there/large.yaml", None, "demo_large"),
     ],
 )
-def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name):
+def test_results_of_another_scale_have_a_name_of_their_own(scale, data, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_bytes(tmp_path / "there/large.yaml", (paths.CONFIGS / "scale/demo.yaml").read_bytes())
     assert comparison.Comparison.load("demo", scale, data, None).name == name
 
 
@@ -870,8 +871,8 @@ def test_causes_of_failures(tmp_path):
 def test_every_comparison_names_what_there_is(name):
     """Its data, scale and methods; a table of the paper has all of the paper's methods."""
     found = comparison.Comparison.load(name, None, None, None, seeds=3)
-    assert found.data.exists() and found.scale.exists() and found.seeds == [0, 1, 2]
-    assert all(Path(file).exists() for method in found.methods for file in found.configs(method))
+    assert found.spec.test and found.seeds == [0, 1, 2]
+    assert all(found.configs[method]["model"]["class_path"] for method in found.methods)
     if found.table:
         assert {m for m in paths.config_names("model") if published(found.table, m)} <= set(found.methods)
     trained = [method for method in found.methods if comparison.build_if_untrained(method) is None]
