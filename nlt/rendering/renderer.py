@@ -305,7 +305,8 @@ def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
 def _photons(scene: Any, masks: bool, emitter: Any, low: Any, high: Any, u0: Any, u1: Any, u2: Any) -> tuple:
     ray, weight = emitter.sample_ray(mi.Float(0), u0, u1, u2)
     interaction = first_surface(scene, ray, masks)
-    to_low, to_high = (low - ray.o) / ray.d, (high - ray.o) / ray.d
+    direction = dr.select(ray.d == 0, 1e-30, ray.d)  # the scalar variant does not divide by zero
+    to_low, to_high = (low - ray.o) / direction, (high - ray.o) / direction
     enter, leave = dr.max(dr.minimum(to_low, to_high)), dr.min(dr.maximum(to_low, to_high))
     crosses = (enter < leave) & (leave > 0) & (enter < interaction.t)
     return ray.o, ray.d, mi.Color3f(weight), interaction.p, interaction.is_valid() & crosses

@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 _PROBE = "import mitsuba as mi; mi.set_variant({!r}); import drjit as dr; print(dr.sum(mi.Float([1, 2])))"
+_TIMEOUT_S = 300  # of a probe, which takes a second; on an overloaded machine, a minute was not enough
 _LIBRARY = "DRJIT_LIBLLVM_PATH"
 _LIBRARIES = (
     "/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*",
@@ -88,6 +89,8 @@ def _works(variant: str, library: str | None) -> bool:
     environment = dict(os.environ, **({_LIBRARY: library} if library else {}))
     probe = [sys.executable, "-c", _PROBE.format(variant)]
     try:
-        return subprocess.run(probe, env=environment, capture_output=True, timeout=60, check=False).returncode == 0
+        return (
+            subprocess.run(probe, env=environment, capture_output=True, timeout=_TIMEOUT_S, check=False).returncode == 0
+        )
     except subprocess.TimeoutExpired:
         return False
