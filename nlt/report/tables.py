@@ -10,10 +10,12 @@ from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 from nlt.report.table_writer import Table, write_texts
 
 # Metrics that the paper does not report.
-_MORE = ("unbiased_mse", "psnr", "flip", "kid", *(key for key in METRICS if key.startswith("feature_l1_")))
+_MORE = tuple(key for key in METRICS if key not in (*COLUMNS, "reference_noise"))
 _SIZES = ("parameters", "flops", "peak_memory_bytes", "train_s", "images_seen")
 _STAGES = (*(f"{stage}_s" for stage in STAGES), "moving_camera_s")
-_BOUNDED = ("mse", "unbiased_mse", "psnr", "mssim", "flip", "feature_l1")
+_BOUNDED = tuple(
+    key for key in METRICS if METRICS[key].per_image and key != "reference_noise" and not key.startswith("feature_l1_")
+)
 
 
 def write_tables(results: Results) -> None:
