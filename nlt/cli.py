@@ -68,14 +68,17 @@ def _run(arguments: list[str]) -> None:
         if arguments[0] == "fit":
             print(f"written to {trainer.log_dir}")
         return
-    options = _parser().parse_args(arguments)
+    options, unknown = _parser().parse_known_args(arguments)
+    if unknown:
+        raise UserError(f"unknown arguments: {' '.join(unknown)}; see nlt {options.command} --help")
     if options.command in ("compare", "render"):  # Mitsuba and PyTorch alternate within a frame
         wait_passively()
     if options.command == "generate":
         from nlt.data.generate import generate
         from nlt.data.spec import load_spec
 
-        print(generate(*load_spec(options.config), options.workers, options.scheduler, dict(options.slurm)))
+        spec, root = load_spec(options.config, options.settings)
+        print(generate(spec, root, options.workers, options.scheduler, dict(options.slurm)))
     elif options.command == "data":
         _run_data(options)
     elif options.command == "compare":
@@ -194,6 +197,10 @@ def _parser() -> argparse.ArgumentParser:
     generate.add_argument(
         "--config", action="append", required=True, help="config by name, for example data/demo, or path; repeatable"
     )
+    generate.add_argument(
+        "settings", nargs="*", type=pair, metavar="KEY=VALUE",
+        help="setting that overrides all configs, for example data.dataset.resolution=32",
+    )  # fmt: skip
     _add_scheduler(generate, "concurrent jobs (default: available CPUs; on Dask, its threads; in a Slurm array, 64)")
     data = commands.add_parser("data", help="show, verify or measure a dataset")
     _add_data(data)

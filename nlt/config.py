@@ -1,7 +1,7 @@
 """Config files: read, merged, and checked against a class with pydantic. Every error is one line."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,15 +32,26 @@ def known(kind: str, name: str) -> str:
     return name
 
 
-def read_configs(files: Sequence[str | Path]) -> dict[str, Any]:
+def read_configs(files: Sequence[str | Path], settings: Iterable[tuple[str, str]] = ()) -> dict[str, Any]:
     """Merge YAML configs, given by path or by name, for example "data/demo"; later ones override earlier ones.
 
-    A config with the key `base` overrides the config of that name in its own folder.
+    A config with the key `base` overrides the config of that name in its own folder. `settings` are dotted keys with
+    values in YAML; they override all configs.
 
     Raises:
         UserError: a file is missing or is not YAML.
     """
-    return reduce(merge, (_read(paths.find_config("", file)) for file in files), {})
+    return reduce(merge, [*(_read(paths.find_config("", file)) for file in files), *map(_nested, settings)], {})
+
+
+def _nested(setting: tuple[str, str]) -> dict[str, Any]:
+    """Return a setting such as ("data.dataset.train", "8") as nested mappings."""
+    key, text = setting
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UserError(f"{key}={text}: not valid YAML: {' '.join(str(error).split())}") from None
+    return reduce(lambda inner, part: {part: inner}, reversed(key.split(".")), value)
 
 
 def _read(file: Path, above: Sequence[Path] = ()) -> dict[str, Any]:

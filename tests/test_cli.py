@@ -93,7 +93,9 @@ def test_help_of_fit(capfd):
         (["generate", "--config=x.yaml", "--workers=two"], ["--workers", "whole number", "two"]),
         (["scenes", "preview", "egg", "--seed=-1"], ["--seed", "at least 0"]),
         (["scenes", "preview", "egg", "-o", "egg.xyz"], ["--output", "egg.xyz", ".png"]),
-        (["generate", "--config=x.yaml", "--nope"], ["--nope", "--help"]),
+        (["generate", "--config=x.yaml", "--nope"], ["--nope", "nlt generate --help"]),
+        (["generate", "--config=x.yaml", "nope"], ["KEY=VALUE", "nope", "nlt generate --help"]),
+        (["compare", "--config=demo", "--methods", "nope"], ["--methods: no model 'nope'", "cnn"]),
         (["generate", "--config=x.yaml", "--slurm=time"], ["--slurm", "KEY=VALUE", "time"]),
         (["compare", "--config"], ["--config", "nlt compare --help"]),
         (["fit"], ["data.dataset.scenes", "model", "nlt fit --help"]),
@@ -144,12 +146,27 @@ def test_configs(refused, with_config, command, content, words):
     refused(with_config(command, content), *words)
 
 
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("data.dataset.train=x", ["data.dataset.train: must be a whole number", "data.dataset.train=x"]),
+        ("data.dataset.nope=1", ["data.dataset.nope: unknown key"]),
+        ("data.dataset.train=[", ["data.dataset.train=[: not valid YAML"]),
+        ("data.dataset.num_points=100000000000", ["no space left on disk", "4500.0 GB"]),
+    ],
+)
+def test_settings_of_generate(refused, with_config, tmp_path, monkeypatch, setting, words):
+    monkeypatch.chdir(tmp_path)
+    refused([*with_config("generate", {}), "data.root=new", setting], *words)
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("command", ["fit", "compare"])
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         ({"model": {"init_args": {"nope": 1}}}, ["bad.yaml", "'nope'", "CNN", "nlt fit --help"]),
-        ({"model": {"init_args": {"width": "wide"}}}, ["bad.yaml", '"width"', "wide", "int"]),
+        ({"model": {"init_args": {"width": "wide"}}}, ["bad.yaml", "width: must be a whole number", "wide"]),
         ({"model": {"init_args": {"width": 0}}}, ["model.init_args.width", "at least 1"]),
         ({"model": {"class_path": "nlt.nope.Nope"}}, ["bad.yaml", "nlt.nope.Nope"]),
         ({"trainer": {"nope": 1}}, ["bad.yaml", "trainer.nope", "nlt fit --help"]),

@@ -48,6 +48,7 @@ RUN = {
     "nlt scenes add room/scene.xml --name room": "",
     "nlt scenes preview room -o room.png": "--views 1 --resolution 16 --spp 1",
     "nlt generate --config data/room --config scale/demo": "--config small.yaml --workers 1",
+    "nlt generate --config data/demo --config scale/demo": "--config data/room --config small.yaml --workers 1",
     "nlt fit --config data/demo --config model/normals_only "
     "--config scale/demo": "--config data/room --config small.yaml --config small_fit.yaml",
 }

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nlt.errors import UserError
 from nlt.models.clouds import CloudMethod
-from nlt.models.module import PROJECTION, Batch, join
+from nlt.models.module import PROJECTION, Batch, join_channels
 from nlt.models.transport import PointEmbedding
 
 INPUTS = ("position", "point_features", "normal", "ray_direction")
@@ -69,4 +69,4 @@ class InputAblation(CloudMethod):
             maps.append(batch["normal"])
         if self.hparams["ray_direction"]:
             maps.append(batch["view_direction"])
-        return join(maps)
+        return join_channels(maps)

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, join, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, join_channels, log_exposed
 
 
 def _hash(x: Tensor) -> Tensor:
@@ -76,4 +76,4 @@ class SparseDenoising(RenderingModule):
         maps = [radiance, mask.to(radiance.dtype)]
         if self.hparams["gbuffer"]:
             maps.append(self.gbuffer(batch))
-        return join(maps)
+        return join_channels(maps)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.models.clouds import CloudMethod
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, join, log_exposed
+from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, join_channels, log_exposed
 from nlt.models.projection import total, visible_pixels
 
 _RADII = (1, 2, 4, 8)  # of footprints, in pixels from the middle one
@@ -60,4 +60,4 @@ class PhotonSplat(CloudMethod):
         return torch.where(depth > 0, chosen[:, :3] / chosen[:, 4:], 0)
 
     def features(self, batch: Batch, transported: Any = None) -> Tensor:
-        return join([self.gbuffer(batch), log_exposed(self.irradiance(batch), batch["exposure"])])
+        return join_channels([self.gbuffer(batch), log_exposed(self.irradiance(batch), batch["exposure"])])

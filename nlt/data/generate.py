@@ -62,12 +62,13 @@ def generate(
     if isinstance(directory, Path):
         directory = directory.absolute()  # workers on other machines have other working directories
     engine = find_engine(scheduler, workers, slurm or {})
+    size = _check_space(spec, directory, missing)
     remove_leftovers(directory)
     variant = choose_variant()
     write_manifest(directory, spec, f"{variant.name}: {variant.reason}")
     print(f"rendering with {variant.name}: {variant.reason}", flush=True)
     _choose_reference_spp(spec, directory, missing)
-    _announce(spec, directory, _shards(spec, missing), engine)
+    _announce(spec, directory, _shards(spec, missing), engine, size)
     _run(spec, directory, engine, partial(_render, spec, str(directory), variant.name))
     return directory
 
@@ -129,17 +130,22 @@ def _pilot(spec: DatasetSpec, scene: int) -> float:
     return float(np.mean(errors))
 
 
-def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine) -> None:
-    """Print the expected size and time; raise UserError if the disk is too small."""
+def _check_space(spec: DatasetSpec, directory: AnyPath, missing: list[str]) -> str:
+    """Return the size of the missing files in words; raise UserError if the disk is too small."""
+    size = sum(shard.size * spec.nbytes(shard.split) for shard in _shards(spec, missing))
+    size += sum(spec.points_nbytes for scene in range(len(spec.scenes)) if points_name(scene) in missing)
+    if not isinstance(directory, Path):
+        return f"{size / 1e9:.2f} GB"
+    free = shutil.disk_usage(next(folder for folder in directory.parents if folder.is_dir())).free
+    if size > free:
+        room = f"the dataset needs {size / 1e9:.1f} GB, but only {free / 1e9:.1f} GB are free"
+        raise UserError(f"{directory}: no space left on disk: {room}")
+    return f"{size / 1e9:.2f} GB of {free / 1e9:.0f} GB free"
+
+
+def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine, cost: str) -> None:
+    """Print the number of samples, their size (`cost`) and the expected time."""
     samples = {split: sum(s.size for s in shards if s.split == split) for split in SPLITS}
-    size = sum(count * spec.nbytes(split) for split, count in samples.items())
-    cost = f"{size / 1e9:.2f} GB"
-    if isinstance(directory, Path):
-        free = shutil.disk_usage(directory).free
-        if size > free:
-            room = f"the dataset needs {size / 1e9:.1f} GB, but only {free / 1e9:.1f} GB are free"
-            raise UserError(f"{directory}: no space left on disk: {room}")
-        cost += f" of {free / 1e9:.0f} GB free"
     if isinstance(engine, Local):  # other machines may be faster or slower
         try:
             mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))

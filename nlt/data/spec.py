@@ -16,7 +16,7 @@ from pydantic import Field as Bound
 
 from nlt.config import Settings, merge, parse, read_configs
 from nlt.data.files import AnyPath, open_path
-from nlt.data.sample import FIELDS, SPLITS, Field
+from nlt.data.sample import FIELDS, POINT_FIELDS, SPLITS, Field
 from nlt.errors import UserError
 from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
@@ -97,6 +97,12 @@ class DatasetSpec:
     def count(self, split: str) -> int:
         """Return the number of samples per scene in a split."""
         return int(getattr(self, split))
+
+    @property
+    def points_nbytes(self) -> int:
+        """The size of one scene's points on disk in bytes."""
+        sizes = self.sizes
+        return sum(field.nbytes(sizes) for field in POINT_FIELDS.values())
 
     def nbytes(self, split: str) -> int:
         """Return the size of one sample on disk in bytes."""
@@ -213,11 +219,13 @@ class _Config(Settings):
     seed_everything: Any = None
 
 
-def load_spec(files: list[str]) -> tuple[DatasetSpec, AnyPath]:
+def load_spec(files: list[str], settings: Collection[tuple[str, str]] = ()) -> tuple[DatasetSpec, AnyPath]:
     """Return the dataset in config files, without training samples that are rendered online, and the root of datasets.
 
-    Raise UserError if a file cannot be read, or has an unknown, missing or invalid key.
+    `settings` are dotted keys with values in YAML, which override the files. Raise UserError if a file cannot be read,
+    or if a key is unknown, missing or has an invalid value.
     """
-    content = merge({"data": {"dataset": {"scenes": []}}}, read_configs(files))
-    data = parse(_Config, content, " + ".join(files)).data
+    content = merge({"data": {"dataset": {"scenes": []}}}, read_configs(files, settings))
+    places = [*files, *("=".join(setting) for setting in settings)]
+    data = parse(_Config, content, " + ".join(places)).data
     return data.dataset.without_train() if data.online else data.dataset, open_path(data.root)

@@ -27,6 +27,9 @@ def _known_method(method: str) -> str:
     return "@".join([known("model", model), *(known("variant", variant) for variant in variants)])
 
 
+_MethodName = Annotated[str, AfterValidator(_known_method)]
+
+
 class _Content(Settings):
     """The content of a config of configs/compare."""
 
@@ -34,7 +37,7 @@ class _Content(Settings):
     data: str
     scale: str
     variant: Annotated[str, AfterValidator(partial(known, "variant"))] | None = None
-    methods: list[Annotated[str, AfterValidator(_known_method)]] | None = None
+    methods: list[_MethodName] | None = None
     seed: NonNegativeInt = 0
 
 
@@ -77,6 +80,8 @@ class Comparison:
         Raises:
             UserError: an unknown key, table, method or file, or a setting that `nlt fit` would refuse.
         """
+        for method in methods or ():
+            parse(_MethodName, method, "--methods")
         file = find_config("compare", config)
         own = read_configs([file])
         changes = {"scale": scale, "data": data, "methods": methods}

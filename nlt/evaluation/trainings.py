@@ -11,6 +11,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import lightning as L
 import torch
@@ -25,7 +26,7 @@ from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
 from nlt.evaluation.provenance import origin
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
-from nlt.training import newest_checkpoint, run_lightning
+from nlt.training import run_lightning
 
 
 @dataclass(frozen=True)
@@ -190,3 +191,11 @@ def fit(run: Path, config: Mapping[str, Any], seed: int, callbacks: Sequence[L.C
         print(f"resuming from {checkpoint}", flush=True)
         arguments.append(f"--ckpt_path={checkpoint}")
     return run_lightning(arguments, callbacks).trainer
+
+
+def newest_checkpoint(run: Path) -> Path | None:
+    """Return a run's latest complete checkpoint, or None; one that a killed process left unfinished is skipped."""
+    for path in sorted(run.glob("checkpoints/*.ckpt"), key=lambda p: p.stat().st_mtime, reverse=True):
+        if is_zipfile(path):  # a zip file's directory is written last
+            return path
+    return None

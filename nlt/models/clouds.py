@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlt.errors import UserError
 from nlt.models.method import Batch
-from nlt.models.module import PROJECTION, Features, RenderingModule, check_at_least, join
+from nlt.models.module import PROJECTION, Features, RenderingModule, check_at_least, join_channels
 from nlt.models.projection import average_sparsely, project, visible_pixels
 from nlt.models.transport import PointEmbedding
 
@@ -67,7 +67,7 @@ class CloudMethod(RenderingModule):
             view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
             projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
             return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]
-        return join([gbuffer, *(self.project(batch, *cloud) for cloud in clouds), *maps])
+        return join_channels([gbuffer, *(self.project(batch, *cloud) for cloud in clouds), *maps])
 
     @property
     def has_point_embeddings(self) -> bool:

@@ -58,7 +58,7 @@ def check_at_least(least: int, **values: int | None) -> None:
             raise UserError(f"model.init_args.{name}: must be at least {least}, is {value}")
 
 
-def join(maps: Sequence[Tensor]) -> Tensor:
+def join_channels(maps: Sequence[Tensor]) -> Tensor:
     """Concatenate maps (B, C, H, W) along the channels, in the layout and precision that the convolutions read."""
     device = maps[0].device.type
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps[0].dtype
@@ -161,7 +161,7 @@ class RenderingModule(Method, L.LightningModule):
 
     def gbuffer(self, batch: Batch) -> Tensor:
         """Return depth, normal, albedo and view direction (B, 10, H, W)."""
-        return join([batch[name] for name in GBUFFER])
+        return join_channels([batch[name] for name in GBUFFER])
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""

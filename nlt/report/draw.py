@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from nlt.evaluation.claims import text, write_claims
 from nlt.evaluation.results import load
+from nlt.report.claims import text, write_claims
 from nlt.report.figures import draw_learning_curves, draw_speed_accuracy
 from nlt.report.gallery import Shown, draw_failures, draw_qualitative, draw_samples
 from nlt.report.page import Section, write_page
@@ -22,8 +22,11 @@ def draw(
     results = load(directory)
     write_tables(results)
     claims = write_claims(results)
-    for claim in claims:
+    measured = [claim for claim in claims if claim.verdict != "not measured"]
+    for claim in measured:
         print(f"{claim.verdict:13}  {claim.id:40} {text(claim)}")
+    if unmeasured := len(claims) - len(measured):
+        print(f"{unmeasured} other claims were not measured; see claims.md")
     draw_speed_accuracy(results)
     draw_learning_curves(results)
     if images := Shown.load(results):

@@ -17,11 +17,12 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup, escape
 
 from nlt.data.files import write_bytes
-from nlt.evaluation.claims import BELOW_FLOOR, Claim
-from nlt.evaluation.claims import text as claim_text
+from nlt.evaluation.claims import Claim
 from nlt.evaluation.paper import label, paper
 from nlt.evaluation.results import OK, TIMES, Results
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
+from nlt.report.claims import BELOW_FLOOR
+from nlt.report.claims import text as claim_text
 from nlt.report.figures import bar, curves
 from nlt.report.gallery import FAILURES, Shown, failures
 from nlt.report.packing import SMALLEST, data_url, max_error, pack_to_fit

@@ -26,15 +26,15 @@ def line(cells: Iterable[object]) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def grid(headings: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
-    """Return the lines of a Markdown table whose first column is text and whose others are numbers."""
-    return [line(headings), "|---|" + "---:|" * (len(headings) - 1), *map(line, rows), ""]
+def grid(headings: Sequence[str], rows: Iterable[Iterable[object]], numbers: bool = True) -> list[str]:
+    """Return the lines of a Markdown table; `numbers` aligns all columns but the first to the right."""
+    return [line(headings), "|---|" + ("---:|" if numbers else "---|") * (len(headings) - 1), *map(line, rows), ""]
 
 
-def section(table: Table, level: int = 2) -> list[str]:
+def section(table: Table, level: int = 2, numbers: bool = True) -> list[str]:
     """Return the lines of a table in Markdown, with its title as a heading of this level and its note."""
     note = [table.note, ""] if table.note else []
-    return [f"{'#' * level} {table.title}", "", *note, *grid([table.first, *table.columns], table.rows)]
+    return [f"{'#' * level} {table.title}", "", *note, *grid([table.first, *table.columns], table.rows, numbers)]
 
 
 def write_texts(path: Path, tables: Sequence[Table], source: str) -> None:

@@ -228,9 +228,8 @@ def _find_source(file: Path, source: str, needed: bool) -> str:
             return str(path.resolve())
     if not needed:
         return str(candidates[-1])
-    raise UserError(
-        f"{file}: source: no scene file at {' or '.join(map(str, candidates))}; set NLT_SCENES to the scenes' folder"
-    )
+    remedy = "correct the path" if Path(source).is_absolute() else "set NLT_SCENES to the scenes' folder"
+    raise UserError(f"{file}: source: no scene file at {' or '.join(map(str, candidates))}; {remedy}")
 
 
 def listing() -> str:

@@ -28,7 +28,7 @@ from nlt.errors import DivergedError, UserError
 from nlt.evaluation.clock import Clock, summary
 from nlt.evaluation.evaluate import evaluate
 from nlt.evaluation.frames import Frames
-from nlt.evaluation.trainings import fit
+from nlt.evaluation.trainings import fit, newest_checkpoint
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.metrics.quantities import METRICS
 from nlt.models.factory import read_checkpoint
@@ -36,7 +36,6 @@ from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.select.choice import ranked
 from nlt.select.space import Candidate, SearchSpace
-from nlt.training import newest_checkpoint
 
 SCORES = ("unbiased_mse", "mssim")  # where they disagree, the first one decides
 _ETA, _ROUNDS = 3, 3  # one in three candidates continues; the largest number of planned rounds

@@ -17,13 +17,13 @@ from tqdm import tqdm
 
 from nlt.data.generate import generate
 from nlt.errors import DivergedError, UserError
-from nlt.evaluation.claims import write_claims
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
 from nlt.evaluation.trainings import Training, train
 from nlt.models.method import Method
 from nlt.models.policy import Policy, accelerate, default_device
+from nlt.report.claims import write_claims
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES
 from nlt.stress.inputs import INPUTS

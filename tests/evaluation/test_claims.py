@@ -7,10 +7,11 @@ import pytest
 import scipy.stats
 from made_results import make_results, papers_numbers
 
-from nlt.evaluation.claims import claims_of, difference, judge, text, write_claims
+from nlt.evaluation.claims import claims_of, difference, judge
 from nlt.evaluation.paper import paper, tables
 from nlt.evaluation.results import load, write_manifest
 from nlt.metrics.quantities import QUANTITIES
+from nlt.report.claims import text, write_claims
 
 
 def verdicts(results):

@@ -21,7 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny import DATASET, SCALE, use_tiny_inception, write
 from torch.utils.data import default_collate
 
-from nlt import paths, training
+from nlt import paths
 from nlt.baselines.cnn import CNN
 from nlt.cli import main
 from nlt.config import merge
@@ -35,7 +35,7 @@ from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.paper import published
 from nlt.evaluation.provenance import origin
 from nlt.evaluation.results import load, write_images, write_rows
-from nlt.evaluation.trainings import Training, train
+from nlt.evaluation.trainings import Training, newest_checkpoint, train
 from nlt.metrics.quantities import METRICS
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, accelerate
@@ -417,7 +417,7 @@ def test_a_killed_training_goes_on(world, more_methods):
 
 
 def same_weights(run, other):
-    weights = [torch.load(training.newest_checkpoint(path), weights_only=True)["state_dict"] for path in (run, other)]
+    weights = [torch.load(newest_checkpoint(path), weights_only=True)["state_dict"] for path in (run, other)]
     return all(torch.equal(weights[0].pop(name), value) for name, value in weights[1].items()) and not weights[0]
 
 

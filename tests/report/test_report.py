@@ -20,11 +20,11 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from nlt.display import display
-from nlt.evaluation.claims import write_claims
 from nlt.evaluation.paper import label, published
 from nlt.evaluation.results import load, write_manifest, write_rows
 from nlt.metrics.quantities import QUANTITIES
 from nlt.report import page as report_page
+from nlt.report.claims import write_claims
 from nlt.report.gallery import Shown, draw_failures
 from nlt.report.packing import STEPS, max_error, pack, pack_to_fit
 from nlt.report.tables import write_tables
