@@ -4,6 +4,7 @@ The static part and each movable object are shape groups with their own accelera
 transforms of their instances. Emitting shapes cannot be instanced and stay plain meshes.
 """
 
+import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -63,6 +64,8 @@ class Scene:
     """
 
     def __init__(self, description: SceneDescription, experiment: str) -> None:
+        # Kernels dispatch to the materials of all scenes in memory, also of unused scenes that cycles keep alive.
+        gc.collect()
         self.description, self.experiment = description, experiment
         self.movables = description.movables(experiment)
         self._own_lights = own_lights = experiment != "moving_lights"

@@ -1,5 +1,7 @@
 """Descriptions are read strictly; states, views and cameras follow the supplementary; units are metres."""
 
+import weakref
+
 import numpy as np
 import pytest
 import yaml
@@ -237,3 +239,14 @@ def test_moving_light_is_as_wide_along_x_as_it_says(tmp_path):
     on_light = points["position"][points["emission"].any(1)]
     assert np.allclose(on_light.min(0), [-0.05, 1.8, -0.5], atol=0.05)
     assert np.allclose(on_light.max(0), [0.25, 1.8, 0.3], atol=0.05)
+
+
+def test_unused_scenes_are_freed(demo):
+    """The next scene frees them, although cycles keep them alive."""
+    renderer = Renderer(Scene(demo, "static"))
+    renderer.itself = renderer
+    scene = weakref.ref(renderer.scene)
+    del renderer
+    assert scene() is not None
+    Scene(demo, "static")
+    assert scene() is None
