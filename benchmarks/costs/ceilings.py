@@ -16,6 +16,7 @@ from nlt.data.render import SampleRenderer
 _ENOUGH = 0.05  # seconds of a call above which overheads are negligible
 MATRICES = (512, 1024, 2048, 4096, 8192)  # side
 BATCHES = (1, 2, 4, 8, 16, 32, 64)  # images of a convolution
+_CHANNELS = _SIDE = 128  # of a convolution
 _COPIED = 1 << 28  # bytes
 
 
@@ -80,8 +81,7 @@ def _matmul(device: torch.device, dtype: torch.dtype, size: int) -> tuple[Callab
 def _convolution(
     device: torch.device, dtype: torch.dtype, layout: torch.memory_format, batch: int
 ) -> tuple[Callable[[], object], float]:
-    channels, side = 128, 128
-    image = torch.ones(batch, channels, side, side, device=device, dtype=dtype).to(memory_format=layout)
-    kernel = torch.ones(channels, channels, 3, 3, device=device, dtype=dtype).to(memory_format=layout)
-    operations = 2.0 * math.prod(kernel.shape) * batch * side**2
+    image = torch.ones(batch, _CHANNELS, _SIDE, _SIDE, device=device, dtype=dtype).to(memory_format=layout)
+    kernel = torch.ones(_CHANNELS, _CHANNELS, 3, 3, device=device, dtype=dtype).to(memory_format=layout)
+    operations = 2.0 * math.prod(kernel.shape) * batch * _SIDE**2
     return lambda: F.conv2d(image, kernel, padding=1), operations

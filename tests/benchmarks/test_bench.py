@@ -111,8 +111,9 @@ def arguments(tmp_path_factory):
         patch.setattr(bench, "_TRAINING_STEPS", 3)
         patch.setattr(clock, "WARM_UP", 1)
         patch.setattr(clock, "FRAMES", 3)
-        patch.setattr(ceilings, "MATRICES", (512,))
+        patch.setattr(ceilings, "MATRICES", (64,))
         patch.setattr(ceilings, "BATCHES", (1,))
+        patch.setattr(ceilings, "_SIDE", 8)
         patch.setattr(ceilings, "_COPIED", 1 << 20)
         yield ["--data", str(data), "--scale", str(scale), "--methods", *METHODS, "--seconds", "1"]
 
