@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, get_type_hints
@@ -101,13 +101,15 @@ class DatasetSpec:
     @property
     def points_nbytes(self) -> int:
         """The size of one scene's points on disk in bytes."""
-        sizes = self.sizes
-        return sum(field.nbytes(sizes) for field in POINT_FIELDS.values())
+        return self._nbytes(POINT_FIELDS)
 
     def nbytes(self, split: str) -> int:
         """Return the size of one sample on disk in bytes."""
+        return self._nbytes(self.fields(split))
+
+    def _nbytes(self, fields: Mapping[str, Field]) -> int:
         sizes = self.sizes
-        return sum(field.nbytes(sizes) for field in self.fields(split).values())
+        return sum(field.nbytes(sizes) for field in fields.values())
 
     @property
     def has_pilots(self) -> bool:
