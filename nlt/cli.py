@@ -225,7 +225,10 @@ def _parser() -> argparse.ArgumentParser:
         "--train-images", nargs="+", type=positive, default=[], metavar="N",
         help="also train every method on the first N images of each scene, for learning curves",
     )  # fmt: skip
-    _add_scheduler(compare, "concurrent training runs (default: 1; on a cluster, as for nlt generate)")
+    _add_scheduler(
+        compare,
+        "concurrent training runs (default and at most: one per core; on a GPU 1; on a cluster, as for generate)",
+    )
     compare.add_argument(
         "--precision", choices=("auto", "32", "bf16"), default="auto",
         help="precision of training, evaluation and timing (default: auto, bf16 if the device supports it natively)",

@@ -22,6 +22,7 @@ from typing import Any
 from nlt.errors import UserError
 from nlt.waiting import as_the_user_said
 
+_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # "quota period" in microseconds, or "max period"
 # work(job, threads, tick) does a job with the given number of threads and calls tick(n) after every n samples.
 Work = Callable[[Any, int, Callable[[int], None]], None]
 # An engine regularly yields the number of samples finished so far, or None if it cannot know.
@@ -109,8 +110,10 @@ def find_engine(scheduler: str, workers: int | None, slurm: Mapping[str, str], p
 
 
 def available_cpus() -> int:
-    """Return the number of CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return the number of CPUs that this process may use: its affinity, and at most its container's quota."""
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, period = _CPU_QUOTA.read_text().split() if _CPU_QUOTA.exists() else ("max", "")
+    return cpus if quota == "max" else max(1, min(cpus, int(quota) // int(period)))
 
 
 class Local(Engine):

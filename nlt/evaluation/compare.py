@@ -55,7 +55,7 @@ def compare(
 
     Args:
         dataset: the directory that `nlt.data.generate.generate` returned.
-        workers: number of trainings that run in parallel (default: one on this machine).
+        workers: number of trainings that run side by side (default: one per core, or one on a GPU).
         scheduler, slurm: as for `nlt.data.engines.find_engine`, for the trainings; the rest runs here.
         after_row: called with the directory after each row is written.
 

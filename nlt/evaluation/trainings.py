@@ -18,7 +18,7 @@ import torch
 import yaml
 
 from nlt.config import merge
-from nlt.data.engines import find_engine
+from nlt.data import engines
 from nlt.data.files import write_bytes
 from nlt.errors import DivergedError, UserError, to_user_error
 from nlt.evaluation.comparison import Comparison
@@ -101,7 +101,9 @@ def train(
     """Run the trainings that have not ended yet; return those that failed twice, with the reason.
 
     Each has its own process, because it may be killed for its memory and because Lightning keeps global state. On
-    this machine they are forked from a process that has imported Lightning, which takes seconds.
+    this machine they are forked from a process that has imported Lightning, which takes seconds. On its processor,
+    several trainings run side by side and share the cores, which is faster than all cores for one after the other;
+    there are never more than cores, because threads that wait for a core slow down all others.
 
     Raises:
         UserError: a config or the dataset is wrong, or the disk is full.
@@ -110,7 +112,11 @@ def train(
     failures: dict[Training, str] = {}
     if not unfinished:
         return failures
-    engine = find_engine(scheduler, workers or (1 if scheduler == "local" else None), slurm, preload=(__name__,))
+    if scheduler == "local":
+        # All trainings count, not only the unfinished ones, so that a resumed one has the same number of threads.
+        most = min(engines.available_cpus(), len(trainings)) if default_device().type == "cpu" else None
+        workers = min(workers or most, most) if most else workers or 1
+    engine = engines.find_engine(scheduler, workers, slurm, preload=(__name__,))
     table = ProgressTable({t.run: t.name for t in unfinished})
     print(f"\n{len(unfinished)} of {len(trainings)} trainings to run, {engine.workers} in parallel", flush=True)
     with closing(engine.run(_train, unfinished, failures)) as ticks:

@@ -9,7 +9,6 @@ import lightning as L
 import torch
 
 from nlt.config import read_configs
-from nlt.data.engines import available_cpus
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.results import DIVERGED, FAILED, OK, read_rows, write_rows
@@ -57,8 +56,7 @@ def train_suite(
         for variation, value, seed, changes in _variations(comparison, method, suite):
             training = Training.of(comparison, method, seed, runs / STRESS, changes=changes)
             jobs.append(({"method": method, "variation": variation, "value": value, "seed": seed}, training))
-    # Networks this small leave a second core idle; an accelerator runs one training at a time.
-    failures = train([training for _, training in jobs], "local", available_cpus() if device.type == "cpu" else 1, {})
+    failures = train([training for _, training in jobs], "local", None, {})
     for row, training in jobs:
         run = training.run.name
         row |= {"status": FAILED if training in failures else OK, "message": failures.get(training, ""), "run": run}

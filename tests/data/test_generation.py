@@ -555,3 +555,13 @@ def test_full_disk_at_the_start(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"no space left on disk.*GB"):
         generate(spec_of(), tmp_path, workers=1)
     assert not list(tmp_path.rglob("*.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("quota", "cpus"), [("max 100000", 4), ("150000 100000", 1), ("250000 100000", 2), ("10 100", 1)]
+)
+def test_cpus_within_a_containers_quota(tmp_path, monkeypatch, quota, cpus):
+    (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(engines, "_CPU_QUOTA", tmp_path / "cpu.max")
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(4))
+    assert engines.available_cpus() == cpus

@@ -452,6 +452,31 @@ def test_rows_that_diverge_or_fail_are_shown(world, trainings, more_methods, cap
     assert len(trainings) == 3
 
 
+@pytest.mark.parametrize(
+    ("cores", "workers", "trainings", "threads"),
+    [(2, None, 3, [1, 1]), (2, 8, 3, [1, 1]), (2, 1, 3, [2]), (2, None, 1, [2]), (6, None, 2, [3, 3])],
+)
+def test_trainings_never_have_more_threads_than_cores(tmp_path, monkeypatch, cores, workers, trainings, threads):
+    """`threads` are those of the trainings that run at once."""
+    started = []
+
+    class Process:
+        def __init__(self, work, job, threads, counter, preload):
+            started.append(threads)
+
+    def interrupt(engine, running):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(engines, "available_cpus", lambda: cores)
+    monkeypatch.setattr(engines, "Process", Process)
+    monkeypatch.setattr(engines.Local, "_wait", interrupt)
+    monkeypatch.setattr(engines.Local, "_cancel", lambda *_: None)
+    jobs = [Training("cnn", seed, tmp_path / str(seed), "{}") for seed in range(trainings)]
+    with pytest.raises(KeyboardInterrupt):
+        train(jobs, "local", workers, {})
+    assert started == threads
+
+
 @pytest.mark.parametrize("section", ["model", "trainer", "data"])
 def test_a_mistake_in_the_last_config(world, trainings, capfd, section):
     """Is found before the first training."""
