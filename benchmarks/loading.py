@@ -40,7 +40,7 @@ from nlt.paths import find_config
 
 def synthetic(spec: DatasetSpec, root: str) -> Path:
     """Write a dataset of random numbers in the form of `spec` and return its directory."""
-    rng, sizes, directory = np.random.default_rng(0), spec.sizes, Path(str(spec.directory(root)))
+    rng, sizes, directory = np.random.default_rng(0), spec.sizes("train"), Path(str(spec.directory(root)))
 
     def array(field: Field) -> np.ndarray:
         shape = field.resolve(sizes)
@@ -128,7 +128,7 @@ def main() -> None:
             dataset = LightTransportDataset(directory, spec, "train", inputs)
             module.directory = directory
             module.split = partial(lambda dataset, name: dataset, dataset)  # type: ignore[method-assign]
-            sizes, stored = spec.sizes, spec.fields("train")
+            sizes, stored = spec.sizes("train"), spec.fields("train")
             nbytes = sum(stored[name].nbytes(sizes) for name in dataset._stored)
             file = Path(folder) / f"{method}.bin"
             file.write_bytes(np.random.default_rng(0).bytes(nbytes * options.samples))

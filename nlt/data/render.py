@@ -57,7 +57,11 @@ class SampleRenderer:
             self._taken[split] = spec.taken(split, self.index)
         self.scene.set_state(spec.state(split, self.index, index, self._taken[split]))
         rng = np.random.default_rng(spec.seeds(split, self.index, index).spawn(2)[1])
-        return self.views.sample(spec.resolution, rng)
+        camera = self.views.sample(spec.resolution, rng)
+        if split == "train" and spec.crop:
+            column, row = rng.integers(spec.resolution - spec.crop + 1, size=2)
+            camera = camera.window(column, row, spec.crop)
+        return camera
 
     def sample(self, split: str, index: int, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Return one sample: all fields of its split, or those in `only`."""
@@ -69,7 +73,7 @@ class SampleRenderer:
         """Return the fields `names` of any view of the scene in its current state, at the camera's resolution."""
         spec, state = self.spec, self.scene.state
         noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds.generate_state(5))
-        sizes = spec.sizes | {"H": camera.height, "W": camera.width}
+        sizes = spec.sizes("test") | {"H": camera.height, "W": camera.width}
         fields = {name: field for name, field in FIELDS.items() if name in names}
         absent = sizes["M"] - len(state.present)  # another scene of the dataset has more movable objects
         sample: dict[str, np.ndarray] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, get_type_hints
@@ -22,6 +22,7 @@ from nlt.scenes.description import Experiment, Integrator, SceneDescription, loa
 from nlt.scenes.state import SceneState, sample_state
 
 FORMAT = 3  # version of the files on disk
+_LEAST_SIDE = 8  # of an image, in pixels
 _DRAWS = 1000  # attempts to find a state that no other split has
 
 
@@ -39,6 +40,8 @@ class DatasetSpec:
         scenes: names in configs/scenes, or paths of scene.yaml files.
         experiment: static, fixed_lights (Table 1) or moving_lights (Table 2).
         resolution: height and width of the images in pixels.
+        crop: height and width of the windows of such images, at random places, that training samples are; 0 for whole
+            images. Validation and test samples are whole images.
         train: training samples per scene; with online training, per scene and epoch.
         val: validation samples per scene.
         test: test samples per scene.
@@ -59,7 +62,8 @@ class DatasetSpec:
 
     scenes: Annotated[list[str], AfterValidator(_not_empty)]
     experiment: Experiment = "moving_lights"
-    resolution: Annotated[int, Bound(ge=8)] = 64
+    resolution: Annotated[int, Bound(ge=_LEAST_SIDE)] = 64
+    crop: NonNegativeInt = 0
     train: NonNegativeInt = 1000
     val: NonNegativeInt = 16
     test: NonNegativeInt = 64
@@ -78,17 +82,20 @@ class DatasetSpec:
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(DatasetSpec, include_extras=True).items():
             setattr(self, name, parse(kind, getattr(self, name), f"data.dataset.{name}"))
+        if self.crop and not _LEAST_SIDE <= self.crop <= self.resolution:
+            bounds = f"{_LEAST_SIDE} to data.dataset.resolution ({self.resolution})"
+            raise UserError(f"data.dataset.crop: must be 0 for whole images, or {bounds}, is {self.crop}")
 
     @cached_property
     def descriptions(self) -> list[SceneDescription]:
         """The descriptions of the scenes, in order."""
         return [load_description(name) for name in self.scenes]
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The sizes that the symbols in the shapes of `FIELDS` stand for."""
+    def sizes(self, split: str) -> dict[str, int]:
+        """Return the sizes that the symbols in the shapes of `FIELDS` stand for in a split."""
         most = max(len(d.movables(self.experiment)) for d in self.descriptions)
-        return {"H": self.resolution, "W": self.resolution, "P": self.num_photons, "N": self.num_points, "M": most}
+        side = self.crop if self.crop and split == "train" else self.resolution
+        return {"H": side, "W": side, "P": self.num_photons, "N": self.num_points, "M": most}
 
     def fields(self, split: str) -> dict[str, Field]:
         """Return the fields that a sample of this split stores."""
@@ -101,15 +108,12 @@ class DatasetSpec:
     @property
     def points_nbytes(self) -> int:
         """The size of one scene's points on disk in bytes."""
-        return self._nbytes(POINT_FIELDS)
+        return sum(field.nbytes(self.sizes("test")) for field in POINT_FIELDS.values())
 
     def nbytes(self, split: str) -> int:
         """Return the size of one sample on disk in bytes."""
-        return self._nbytes(self.fields(split))
-
-    def _nbytes(self, fields: Mapping[str, Field]) -> int:
-        sizes = self.sizes
-        return sum(field.nbytes(sizes) for field in fields.values())
+        sizes = self.sizes(split)
+        return sum(field.nbytes(sizes) for field in self.fields(split).values())
 
     @property
     def has_pilots(self) -> bool:

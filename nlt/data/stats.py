@@ -15,6 +15,7 @@ from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB
 from nlt.data.render import SampleRenderer
+from nlt.data.sample import FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
@@ -54,7 +55,8 @@ def stats(place: str, workers: int | None = None) -> str:
         if len(fields) != 1:
             lines.append(f"{stage:18}{'':>25}{timed}")
         for name in fields:
-            sizes = "".join(f"{s.fields('test')[name].nbytes(s.sizes):>{w},}" for s, w in ((spec, 10), (paper, 15)))
+            field = FIELDS[name]
+            sizes = "".join(f"{field.nbytes(s.sizes('test')):>{width},}" for s, width in ((spec, 10), (paper, 15)))
             lines.append(f"{name if len(fields) == 1 else '  ' + name:18}{sizes}{timed if len(fields) == 1 else ''}")
     lines += [
         f"Seconds are measured in {workers} concurrent processes, each with {_SAMPLES} samples per scene after "

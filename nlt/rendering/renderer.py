@@ -101,6 +101,8 @@ class Renderer:
         sensor = mi.load_dict({
             "type": "perspective",
             "fov": camera.fov,
+            "principal_point_offset_x": 0.5 - float(camera.matrix[0, 2]) / camera.width,
+            "principal_point_offset_y": 0.5 - float(camera.matrix[1, 2]) / camera.height,
             "near_clip": 1e-4,
             "to_world": sensor_to_world(camera, self.scene.description.units_per_metre),
             "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},

@@ -36,6 +36,15 @@ class Camera:
         # Stored samples are float32. Rounding here makes the rendered camera equal to the stored one.
         return cls(matrix.astype(np.float32), world_to_view.astype(np.float32), width, height)
 
+    def window(self, column: int, row: int, size: int) -> Camera:
+        """Return the camera of a square window of the image, `size` pixels wide, with its first pixel at (column, row).
+
+        Its pixels see what they see in the image; the principal point lies outside the window's middle.
+        """
+        matrix = self.matrix.copy()
+        matrix[:2, 2] -= column, row
+        return Camera(matrix, self.world_to_view, size, size)
+
     @property
     def rotation(self) -> np.ndarray:
         """(3, 3) view-to-world rotation, float64."""

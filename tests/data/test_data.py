@@ -45,11 +45,12 @@ def test_fields(dataset):
         for row in range(shard.stop - shard.start):
             sample = reader.read(dataset / shard.name, row, fields)
             for name, field in fields.items():
-                assert sample[name].shape == field.resolve(spec.sizes) and sample[name].dtype == field.dtype, name
+                shape = field.resolve(spec.sizes(shard.split))
+                assert sample[name].shape == shape and sample[name].dtype == field.dtype, name
                 assert np.isfinite(sample[name]).all(), name
     points = store.read_points(dataset / store.points_name(0))
     for name, field in POINT_FIELDS.items():
-        assert points[name].shape == field.resolve(spec.sizes) and points[name].dtype == field.dtype, name
+        assert points[name].shape == field.resolve(spec.sizes("test")) and points[name].dtype == field.dtype, name
 
 
 def test_samples_differ_and_mean_what_they_say(dataset, demo):
@@ -191,7 +192,7 @@ def test_batch(dataset):
         fields = {**spec_of().fields(split), **BATCH_FIELDS}
         assert batch.keys() == fields.keys()
         for name, field in fields.items():
-            assert batch[name].shape == (4, *field.resolve(spec_of().sizes)), name
+            assert batch[name].shape == (4, *field.resolve(spec_of().sizes(split))), name
             kind = str(batch[name].dtype).removeprefix("torch.")
             assert kind == field.dtype.replace("float16", "float32"), name
 

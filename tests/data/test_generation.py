@@ -1,5 +1,6 @@
 """Generation writes the same bytes however often it is interrupted, on every engine and on every file system."""
 
+import dataclasses
 import errno
 import json
 import multiprocessing
@@ -15,11 +16,13 @@ from pathlib import Path
 
 import drjit as dr
 import fsspec
+import lightning as L
 import numpy as np
 import pytest
 from conftest import write_room
 from generated import SIZE, content, spec_of
 from remote import RemoteFileSystem
+from tiny import SCALE, write
 
 from nlt.data import engines, files, store
 from nlt.data import generate as generation
@@ -30,6 +33,7 @@ from nlt.data.verify import verify
 from nlt.errors import UserError
 from nlt.paths import PROJECT
 from nlt.scenes.lanes import is_jit
+from nlt.training import run_lightning
 
 pytestmark = pytest.mark.slow
 
@@ -565,3 +569,64 @@ def test_cpus_within_a_containers_quota(tmp_path, monkeypatch, quota, cpus):
     monkeypatch.setattr(engines, "_CPU_QUOTA", tmp_path / "cpu.max")
     monkeypatch.setattr("os.sched_getaffinity", lambda _: range(4))
     assert engines.available_cpus() == cpus
+
+
+# ---- crops ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("crop", "words"),
+    [(4, "crop: must be 0 .* 8 to data.dataset.resolution .16., is 4"), (17, "is 17"), (-1, "crop")],
+)
+def test_crop_refused(crop, words):
+    with pytest.raises(UserError, match=words):
+        spec_of(crop=crop)
+
+
+@pytest.fixture(scope="module")
+def crops(tmp_path_factory):
+    """A dataset like `dataset`, but its training samples are windows."""
+    return generate(spec_of(crop=8), tmp_path_factory.mktemp("crops"), workers=1)
+
+
+def test_crops_are_windows_of_the_images(dataset, crops):
+    """Training samples are windows of the views that whole images would show; the other splits are the same bytes."""
+    spec, whole = spec_of(crop=8), spec_of()
+    verify(str(crops))
+    assert {k: v for k, v in content(crops).items() if k.startswith(("test", "val"))} == {
+        k: v for k, v in content(dataset).items() if k.startswith(("test", "val"))
+    }
+    reader, corners = store.ShardReader(), set()
+    for index in range(spec.train):
+        cut, full = (
+            reader.read(folder / s.shard("train", 0, index).name, index % spec.shard_size, s.fields("train"))
+            for folder, s in ((crops, spec), (dataset, whole))
+        )
+        column, row = (full["camera_matrix"] - cut["camera_matrix"])[:2, 2].astype(int)
+        corners.add((column, row))
+        inside = np.s_[:, row : row + 8, column : column + 8]
+        for name in ("depth", "normal", "albedo"):
+            np.testing.assert_allclose(cut[name], full[name][inside], rtol=1e-3, atol=1e-3)
+        for name in ("photon_hit", "photon_flux", "translation", "world_to_view"):
+            assert np.array_equal(cut[name], full[name])
+        assert cut["noisy"].shape == cut["noisy_input"].shape == (3, 8, 8)
+    assert len(corners) > 6 and all(0 <= c <= 8 for corner in corners for c in corner)
+
+
+@pytest.mark.parametrize("method", ["nlt_photons", "photon_splat", "denoising_1_4"])
+def test_training_on_crops(crops, tmp_path, monkeypatch, method):
+    """It trains on windows and is validated on whole images."""
+    monkeypatch.chdir(tmp_path)
+    sides = []
+    fields = {"dataset": dataclasses.asdict(spec_of(crop=8)), "root": str(crops.parent), "batch_size": 4}
+    config = write(tmp_path / "crops.yaml", {"data": fields, **SCALE})
+
+    class Sides(L.Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            sides.append(("train", *batch["noisy"].shape[2:]))
+
+        def on_validation_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            sides.append(("val", *outputs.shape[2:]))
+
+    run_lightning(["fit", f"--config={config}", f"--config=model/{method}"], [Sides()])
+    assert set(sides) == {("train", 8, 8), ("val", 16, 16)}

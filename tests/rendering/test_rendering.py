@@ -219,6 +219,24 @@ def test_sparse_pixels(renderer, demo, monkeypatch):
     assert p_value(batched, mean, variance) > ALPHA
 
 
+def test_window_of_an_image(renderer, demo):
+    """Radiance and G-buffer of a window are those of its pixels in the whole image."""
+    state = away("moving_lights", demo)
+    renderer.scene.set_state(state)
+    camera = sample_view(demo, 24, np.random.default_rng(4))
+    window = camera.window(11, 3, 8)
+    inside = (slice(None), slice(3, 11), slice(11, 19))
+    mean, variance = moments(plain_scene(demo, "moving_lights", state), camera, 1024, 1)
+    ours = samples_of(renderer, window, 16, range(64))
+    assert p_value(ours, mean[inside], variance[inside] / 1024) > ALPHA
+    beside = (slice(None), slice(3, 11), slice(9, 17))
+    assert p_value(ours, mean[beside], variance[beside] / 1024) < 1e-6, "the test cannot tell windows apart"
+    whole, part = renderer.gbuffer(camera), renderer.gbuffer(window)
+    for name, values in part.items():
+        np.testing.assert_allclose(values, whole[name][inside], rtol=1e-4, atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(window.view_directions(), camera.view_directions()[inside], atol=1e-6)
+
+
 def test_one_spp_is_unbiased(renderer, demo):
     """The mean of many images of 1 spp is the image of many spp, because nothing is clamped."""
     state = rest_state(demo, "moving_lights")
@@ -580,13 +598,14 @@ def test_probe():
 
 
 def test_scalar_agrees(renderer, demo):
-    """The scalar variant has the same expectation as the variant that runs here."""
+    """The scalar variant has the same expectation as the variant that runs here, also in a window of an image."""
     code = (
         "import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()\n"
         "from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene\n"
         "from nlt.scenes.description import load_description; from nlt.scenes.state import rest_state, sample_view\n"
         "d = load_description('living_room'); r = Renderer(Scene(d, 'moving_lights'))\n"
-        "r.scene.set_state(rest_state(d, 'moving_lights')); c = sample_view(d, 12, np.random.default_rng(7))\n"
+        "r.scene.set_state(rest_state(d, 'moving_lights'))\n"
+        "c = sample_view(d, 20, np.random.default_rng(7)).window(7, 1, 12)\n"
         "np.save(sys.stdout.buffer, np.stack([r.radiance(c, 8, s) for s in range(40)]))\n"
     )
     environment = dict(os.environ, NLT_VARIANT="scalar_rgb")
@@ -594,5 +613,6 @@ def test_scalar_agrees(renderer, demo):
     images = np.frombuffer(done.stdout[-40 * 3 * 144 * 4 :], np.float32).reshape(40, 3, 12, 12)
     scalar = np.einsum("xc,nchw->nxhw", XYZ, images)
     renderer.scene.set_state(rest_state(demo, "moving_lights"))
-    ours = samples_of(renderer, sample_view(demo, 12, np.random.default_rng(7)), 8, range(50, 90))
+    window = sample_view(demo, 20, np.random.default_rng(7)).window(7, 1, 12)
+    ours = samples_of(renderer, window, 8, range(50, 90))
     assert p_value(ours, scalar.mean(0), scalar.var(0, ddof=1) / 40) > ALPHA
