@@ -91,7 +91,7 @@ class CloudMethod(RenderingModule):
         return batch
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return Adam's parameter groups: the point embeddings have their own rate and decay."""
+        """Return the optimiser's parameter groups: the point embeddings have their own rate and decay."""
         embeddings = [p for part in self.modules() if isinstance(part, PointEmbedding) for p in part.parameters()]
         if not embeddings:
             return super().parameter_groups()

@@ -19,6 +19,7 @@ from nlt.errors import DivergedError, UserError
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models import losses
 from nlt.models.method import Batch, Method
+from nlt.models.muon import Muon
 from nlt.models.projection import SparseMap
 from nlt.models.unet import UNet
 
@@ -84,6 +85,7 @@ class RenderingModule(Method, L.LightningModule):
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
         loss: Literal["mse", "relative_mse"] = "mse",
+        optimizer: Literal["adam", "muon"] = "adam",
         learning_rate: float = 5e-4,
         lr_schedule: Literal["paper", "cosine"] = "paper",
         lr_decay: float = 0.99,
@@ -101,7 +103,9 @@ class RenderingModule(Method, L.LightningModule):
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
             loss: name of a function in nlt.models.losses.
-            learning_rate: Adam's learning rate; with the schedule "cosine", its peak.
+            optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
+                biases and the embeddings (nlt/models/muon.py).
+            learning_rate: the optimiser's learning rate; with the schedule "cosine", its peak.
             lr_schedule: "paper" multiplies the rate by `lr_decay` after each epoch. "cosine" changes it at every step:
                 a linear warm-up over the first 5 % of the steps, then half a cosine down to zero.
             lr_decay: factor on the learning rate after each epoch, with the schedule "paper".
@@ -203,13 +207,19 @@ class RenderingModule(Method, L.LightningModule):
         return loss
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return Adam's parameter groups: one, unless some parameters have options of their own."""
+        """Return the optimiser's parameter groups: the network's, and those with options of their own."""
         return [{"params": list(self.parameters())}]
 
     def configure_optimizers(self) -> Any:
         chosen = self.hparams
         groups, rate = self.parameter_groups(), chosen["learning_rate"]
-        optimizer = torch.optim.Adam(groups, lr=rate, decoupled_weight_decay=True, fused=True)
+        kind: type[torch.optim.Adam] = torch.optim.Adam
+        if chosen["optimizer"] == "muon":
+            kind, (network, *others) = Muon, groups
+            is_matrix = lambda p: p.ndim > 1 and p is not self.unet.conv_out.weight
+            matrices, rest = [[p for p in network["params"] if is_matrix(p) == wanted] for wanted in (True, False)]
+            groups = [{"params": rest}, {"params": matrices, "orthogonal": True}, *others]
+        optimizer = kind(groups, lr=rate, decoupled_weight_decay=True, fused=True)
         if chosen["lr_schedule"] == "paper":
             return [optimizer], [ExponentialLR(optimizer, gamma=chosen["lr_decay"])]
         steps = int(self.trainer.estimated_stepping_batches)

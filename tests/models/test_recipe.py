@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lightning as L
 import pytest
+import scipy.linalg
 import torch
 from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, SequentialLR
@@ -14,6 +15,7 @@ from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.feature_projection import FeatureProjection
 from nlt.errors import UserError
 from nlt.models.module import warm_up_and_cosine
+from nlt.models.muon import Muon, orthogonalize
 from nlt.models.nlt import NeuralLightTransport
 from nlt.training import Checkpoints
 
@@ -35,7 +37,9 @@ class Rates(L.Callback):
         self.rates.append([group["lr"] for group in optimizer.param_groups])
 
     def on_train_batch_end(self, trainer, pl_module, *_):
-        self.norms.append(float(torch.cat([p.grad.flatten() for p in pl_module.parameters()]).norm()))
+        self.norms.append(
+            float(torch.cat([p.grad.flatten() for p in pl_module.parameters() if p.grad is not None]).norm())
+        )
 
 
 def test_the_cosine_schedule_is_torchs():
@@ -52,13 +56,16 @@ def test_the_cosine_schedule_is_torchs():
     assert [warm_up_and_cosine(step, 1) for step in (0, 1)] == [1, 1]
 
 
-def test_the_rate_changes_at_every_step_and_resumes_exactly(tmp_path):
+@pytest.mark.parametrize("optimizer", ["adam", "muon"])
+def test_the_rate_changes_at_every_step_and_resumes_exactly(tmp_path, optimizer):
     """Eight steps in one go, or four, a checkpoint and four more: the same rates, the same weights to the bit."""
     data = loader(4)
 
     def fit(*callbacks, **given):
         torch.manual_seed(0)
-        model = FeatureProjection(**SIZE, lr_schedule="cosine", embedding_lr=0.1, learning_rate=0.01)
+        model = FeatureProjection(
+            **SIZE, lr_schedule="cosine", embedding_lr=0.1, learning_rate=0.01, optimizer=optimizer
+        )
         rates, kept = Rates(), Checkpoints()
         trainer = L.Trainer(default_root_dir=tmp_path, max_steps=8, callbacks=[rates, kept, *callbacks], **QUIET)
         trainer.fit(model, data, **given)
@@ -66,7 +73,9 @@ def test_the_rate_changes_at_every_step_and_resumes_exactly(tmp_path):
 
     _, through, whole = fit()
     steps = [0.01 * warm_up_and_cosine(step, 8) for step in range(8)]
-    torch.testing.assert_close(torch.tensor(whole), torch.tensor([[rate, 0.1 * rate] for rate in steps]))
+    torch.testing.assert_close(
+        torch.tensor(whole), torch.tensor([[*[rate] * (1 + (optimizer == "muon")), 0.1 * rate] for rate in steps])
+    )
     half, _, first = fit(_StopAfter(4))
     _, resumed, rest = fit(ckpt_path=half, weights_only=True)
     assert first + rest == whole
@@ -134,3 +143,48 @@ def test_training_computes_the_photons_that_are_seen(points):
     for seen, every in zip(*gradients, strict=True):
         torch.testing.assert_close(seen, every, rtol=1e-8, atol=1e-12)
     assert 0 < given[0] < given[1] == 2 * PHOTONS
+
+
+# ---- Muon -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(5, 40), (40, 5), (16, 16)])
+def test_orthogonalised_matrices(shape):
+    """The singular vectors stay, and the singular values come near 1."""
+    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    left, _, right = (torch.from_numpy(part) for part in scipy.linalg.svd(matrix.numpy(), full_matrices=False))
+    values = left.T @ orthogonalize(matrix) @ right.T
+    assert values.diagonal().min() > 0.6 and values.diagonal().max() < 1.3
+    torch.testing.assert_close(values, values.diagonal().diag(), atol=1e-3, rtol=0)
+
+
+def test_muon_is_torchs_and_adam_where_it_does_not_apply():
+    """Three steps from the same gradients; PyTorch's Muon takes matrices only and computes in bfloat16."""
+    generator = torch.Generator().manual_seed(0)
+    weight, bias = torch.randn(6, 4, 3, 3, generator=generator), torch.randn(6, generator=generator)
+    ours = [weight.clone().contiguous(memory_format=torch.channels_last), bias.clone()]
+    theirs = [weight.flatten(1).clone(), bias.clone()]
+    optimizer = Muon([{"params": ours[:1], "orthogonal": True}, {"params": ours[1:]}], lr=0.01)
+    adam = torch.optim.Adam(theirs[1:], lr=0.01)
+    muon = torch.optim.Muon(theirs[:1], lr=0.01, weight_decay=0, adjust_lr_fn="match_rms_adamw")
+    for _ in range(3):
+        slopes = [torch.randn(x.shape, generator=generator) for x in (weight, bias)]
+        for parameters in (ours, theirs):
+            for parameter, slope in zip(parameters, slopes, strict=True):
+                parameter.grad = slope.view(parameter.shape).clone()
+        for one in (optimizer, adam, muon):
+            one.step()
+    torch.testing.assert_close(ours[1], theirs[1])
+    moved = (ours[0] - weight).flatten(1)
+    assert (moved - (theirs[0] - weight.flatten(1))).norm() < 0.03 * moved.norm()
+
+
+def test_muon_applies_to_the_matrices_of_a_method():
+    """Adam keeps the last layer, the biases and the embeddings, with their own rate."""
+    method = NeuralLightTransport(use_photons=True, optimizer="muon", embedding_lr=0.1, lr_schedule="paper", **SIZE)
+    (optimizer,), _ = method.configure_optimizers()
+    names = {id(parameter): name for name, parameter in method.named_parameters()}
+    rest, matrices, embeddings = [{names[id(p)] for p in group["params"]} for group in optimizer.param_groups]
+    assert matrices == {n for n, p in method.named_parameters() if p.ndim > 1} - {"unet.conv_out.weight", *embeddings}
+    assert embeddings == {"embedding.table.weight"} and rest | matrices | embeddings == set(names.values())
+    assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([5e-4, 5e-4, 5e-5])
