@@ -165,11 +165,24 @@ def _methods(results: Results) -> list[dict[str, Any]]:
             "id": method,
             "label": label(method),
             "status": results.status(method),
+            "command": _command(results, method),
             "values": _values(results, method, others),
             "times": [_values(results.on(device), method, TIMES) for device in results.devices],
         }
         for method in results.methods
     ]
+
+
+def _command(results: Results, method: str) -> str:
+    """Return the command that renders a video with a trained method, or that measures an untrained one again."""
+    for run in results.runs_of(method):
+        if isinstance(run.get("run"), str):
+            config = (results.manifest.get("configs") or {}).get(method, {})
+            scene = config.get("data", {}).get("dataset", {}).get("scenes", ["SCENE"])[0]
+            return f"nlt render {run['run']}/checkpoints/*.ckpt {scene} -o {method}.mp4"
+    words = str(results.manifest.get("command") or "").replace("=", " ").split()
+    options = [(word, words[k + 1]) for k, word in enumerate(words) if word in ("--config", "--scale", "--data")]
+    return " ".join(["nlt compare", *(" ".join(o) for o in options), f"--methods {method} --out results/{method}"])
 
 
 def _values(results: Results, method: str, keys: Iterable[str]) -> dict[str, list[Any]]:

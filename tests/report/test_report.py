@@ -642,6 +642,42 @@ def test_chart(open_report, stored):
     assert report.state()["a"] == "nlt"
 
 
+def test_which_should_i_use(open_report, stored):
+    """The best method within the budget, its picture, and the command that renders with it."""
+    report = open_report()
+    page = report.page
+    with (stored / "table.csv").open(newline="") as file:
+        rows = {
+            row["method"]: row for row in csv.DictReader(file) if row["time_per_frame_s"] and row["method"] in TROUBLED
+        }
+    seconds = {method: float(row["time_per_frame_s"]) for method, row in rows.items()}
+    for key, pick in (("mssim", max), ("mse", min)):
+        page.select_option("#choose-y", key)
+        for share in (0, 40, 100):
+            page.locator("#choose-time").fill(str(share))
+            limit = float(page.locator("#choose-limit").inner_text().removesuffix(" ms")) / 1e3
+            within = [m for m in seconds if seconds[m] <= 1.01 * limit]  # the limit is shown with three digits
+            best = pick(within, key=lambda m: float(rows[m][key]))
+            page.wait_for_function("id => $('choose-picture').dataset.drawn === id", arg=best)
+            answer = page.locator("#choose-answer").inner_text()
+            assert answer.startswith(label(best) + ": ") and f"{len(rows) - len(within)} slower" in answer + "0 slower"
+            assert f"runs/{best}-" in page.locator("#choose-command").inner_text()
+            shown = report.read("() => $('choose-picture')", SIZE)
+            assert np.abs(shown - displayed(radiance(stored, best))).max() < 1
+    page.locator("#next").click()
+    report.state()
+    assert np.abs(report.read("() => $('choose-picture')", SIZE) - displayed(radiance(stored, best, 1))).max() < 1
+
+
+def test_command_of_an_untrained_method(tmp_path):
+    made = make_results(tmp_path, {"oidn_1": {"mse": 0.1}}, None)
+    made.manifest["command"] = "nlt compare --config=front --data demo --seeds 3 --methods cnn --out results/x"
+    for run in made.runs:
+        run.pop("run", None)
+    expected = "nlt compare --config front --data demo --methods oidn_1 --out results/oidn_1"
+    assert report_page._command(made, "oidn_1") == expected
+
+
 def test_without_times(open_report, tmp_path):
     """As of the ablation, whose methods lie in a folder: no chart over time, and everything else."""
     rows = {

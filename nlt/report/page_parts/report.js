@@ -235,6 +235,40 @@ for (const id of ["chart", "budget"]) {
   if (id === "chart") $(id).addEventListener("keydown", (event) => ["Enter", " "].includes(event.key) && show(event));
 }
 
+// ---- which should I use ----
+
+let chosen = null; // the method that the section recommends
+
+// Recommends the most accurate method within the time that the slider allows.
+function choose() {
+  const key = $("choose-y").value, time = "time_per_frame_s", has = (method) => key in valuesOf(method) && valuesOf(method)[time]?.[0] > 0;
+  const points = data.methods.filter(has).map((method) => ({ method, x: valuesOf(method)[time][0], y: valuesOf(method)[key][0] }));
+  $("choose").hidden = !points.length;
+  if (!points.length) return;
+  const front = paretoFront(points, signOf(key)), [fastest, slowest] = [front[0].x, front.at(-1).x];
+  const limit = fastest * (slowest / fastest) ** ($("choose-time").value / 100);
+  chosen = front.findLast((point) => point.x <= limit * (1 + 1e-9)).method;
+  const peers = points.filter((point) => point.method !== chosen && point.x > limit).length;
+  $("choose-limit").textContent = `${plain(1e3 * limit)} ms`;
+  $("choose-answer").innerHTML = `<strong>${escapeText(chosen.label)}</strong>: ${valuesOf(chosen)[time][3]} s a frame,
+    ${escapeText(data.quantities[key].heading)} ${escapeText(valuesOf(chosen)[key][3])}.
+    ${peers ? `${peers} slower ${peers > 1 ? "methods are" : "method is"} left out.` : ""}`;
+  $("choose-command").textContent = chosen.command;
+  $("choose-command").hidden = !chosen.command;
+  if (data.views.length) drawChosen();
+}
+
+async function drawChosen() {
+  const { view, ev } = state, { id, label } = chosen, canvas = $("choose-picture");
+  canvas.hidden = !kindOf.has(id);
+  if (canvas.hidden) return;
+  const images = await imagesOf(view);
+  if (id !== chosen.id || view !== state.view) return; // another one was chosen meanwhile
+  canvas.getContext("2d").drawImage(picture(images, id, ev, false), 0, 0);
+  canvas.setAttribute("aria-label", `${label}, view ${data.views[view].view}`);
+  canvas.dataset.drawn = id; // the tests wait for this
+}
+
 function drawStages() {
   const time = (method) => valuesOf(method).time_per_frame_s?.[0] ?? 0;
   const most = Math.max(...data.methods.map(time));
@@ -375,6 +409,7 @@ async function draw() {
     context.restore();
   }
   for (const button of $("strip").children) put(button.dataset.id, button.firstElementChild.getContext("2d"));
+  if (chosen) drawChosen();
   main.dataset.drawn = JSON.stringify(state); // the tests wait for this
 }
 
@@ -559,11 +594,13 @@ function startViewer() {
 
 function drawAll() {
   drawChart();
+  choose();
   drawStages();
   if (data.views.length) draw();
 }
 
 for (const id of ["chart-x", "chart-y"]) $(id).addEventListener("change", drawChart);
+for (const id of ["choose-time", "choose-y"]) $(id).addEventListener("input", choose);
 $("device").addEventListener("change", () => {
   device = Number($("device").value);
   drawAll();
