@@ -27,6 +27,19 @@ def seen_area(batch: Batch) -> Tensor:
     return (batch["depth"].square() * along / (focal * cosine)).abs()
 
 
+def box_sums(table: Tensor, radius: int) -> Tensor:
+    """Return the sums (B, C, H, W) over the pixels within `radius` rows and columns, from a summed-area table.
+
+    `table` (B, C, H + 1, W + 1) has the sum over all pixels above and to the left of each pixel corner (Crow 1984).
+    """
+    for axis in (2, 3):
+        size = table.shape[axis] - 1
+        pixel = torch.arange(size, device=table.device)
+        first, behind = (pixel - radius).clamp(min=0), (pixel + radius + 1).clamp(max=size)
+        table = table.index_select(axis, behind) - table.index_select(axis, first)
+    return table
+
+
 class PhotonSplat(CloudMethod):
     """The U-Net on the G-buffer and the log of the irradiance, a photon density estimate (Jensen 1996)."""
 
@@ -54,8 +67,9 @@ class PhotonSplat(CloudMethod):
         arrived = torch.where(depth > 0, total(carried, pixels, *depth.shape[-2:]), 0)
         sums = torch.cat([arrived, seen_area(batch)], dim=1)
         chosen = sums
+        table = F.pad(sums.double().cumsum(2).cumsum(3), (1, 0, 1, 0))  # in float32, differences would lose digits
         for radius in _RADII if self.hparams["footprint"] else ():
-            wider = F.avg_pool2d(sums, 2 * radius + 1, 1, radius, divisor_override=1)
+            wider = box_sums(table, radius).to(sums.dtype)
             chosen = torch.where(chosen[:, 3:4] < self.hparams["footprint"], wider, chosen)
         return torch.where(depth > 0, chosen[:, :3] / chosen[:, 4:], 0)
 
