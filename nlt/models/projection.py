@@ -149,4 +149,9 @@ def project(
     The other arguments are those of `visible_pixels`.
     """
     pixels = visible_pixels(positions, valid, camera_matrix, world_to_view, depth, normal, epsilon)
-    return average(features, pixels, *depth.shape[-2:])
+    height, width = depth.shape[-2:]
+    if not features.requires_grad:  # an exported program has no shapes that depend on the data
+        return average(features, pixels, height, width)
+    visible = pixels < height * width
+    first = height * width * torch.arange(len(pixels), device=pixels.device)[:, None]
+    return average_rows(features[visible], (pixels + first)[visible], len(pixels), height, width)
