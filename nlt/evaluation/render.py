@@ -78,7 +78,7 @@ class ModelRenderer:
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """Return the fields of a frame that the method reads, as a batch of one."""
         images = {*self.method.fields} & {"depth", "normal", "albedo", "emission", "noisy_input"}
-        sparse = self.method.pixel_fraction < 1
+        sparse = 0 < self.method.pixel_fraction < 1
         images -= {"noisy_input"} if sparse else set()
         self._set_state(state)
         if state.key != self._key:
