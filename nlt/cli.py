@@ -154,6 +154,7 @@ def _render(options: argparse.Namespace) -> None:
         fps=options.fps,
         spp=options.spp,
         photons=options.photons,
+        layers=options.exr,
     )
 
 
@@ -291,6 +292,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         "--spp", type=_spp, help="samples per pixel of path tracing; 0 omits it (default: equal, at equal time)"
     )
     parser.add_argument("--photons", type=positive, help="number of input photons (default: as in training)")
+    parser.add_argument("--exr", action="store_true", help="also write each frame as a multi-layer EXR into the folder")
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
