@@ -24,6 +24,7 @@ pytestmark = pytest.mark.slow
 FINEST = 64  # --resolution
 POSITION, TARGET = (-1.5, 1.3, 0.2), (0.5, 2.0, 0.0)  # of the camera; it sees the ceiling light
 WINDOW = {"width": 1000, "height": 640}
+PATIENCE = 600  # seconds to wait on a busy machine
 NEAR = 0.02  # mean difference of displayed values in [0, 1]: the browser interpolates, and axes cover a corner
 
 
@@ -49,6 +50,7 @@ def open_page(browser, process, model, tmp_path):
 
     def open_():
         context = browser.new_context(viewport=WINDOW, accept_downloads=True)
+        context.set_default_timeout(1000 * PATIENCE)
         page = context.new_page()
         requests = []
         page.on("request", lambda request: requests.append(request.url))
@@ -144,7 +146,7 @@ class Shown(SimpleNamespace):
         return box["x"] + x / z / camera.width * box["width"], box["y"] + y / z / camera.height * box["height"]
 
 
-def until(is_so, page, seconds=600):
+def until(is_so, page, seconds=PATIENCE):
     """Wait, however slow the machine; fail if it does not become so."""
     end = time.monotonic() + seconds
     while not is_so():
