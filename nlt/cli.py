@@ -71,7 +71,7 @@ def _run(arguments: list[str]) -> None:
     options, unknown = _parser().parse_known_args(arguments)
     if unknown:
         raise UserError(f"unknown arguments: {' '.join(unknown)}; see nlt {options.command} --help")
-    if options.command in ("compare", "render"):  # Mitsuba and PyTorch alternate within a frame
+    if options.command in ("compare", "render", "view"):  # Mitsuba and PyTorch alternate within a frame
         wait_passively()
     if options.command == "generate":
         from nlt.data.generate import generate
@@ -89,6 +89,8 @@ def _run(arguments: list[str]) -> None:
         export(options.checkpoint, options.output, options.resolution, options.photons)
     elif options.command == "render":
         _render(options)
+    elif options.command == "view":
+        _view(options)
     elif options.command == "select":
         from nlt.select.run import select
 
@@ -154,7 +156,16 @@ def _render(options: argparse.Namespace) -> None:
         fps=options.fps,
         spp=options.spp,
         photons=options.photons,
+        layers=options.exr,
     )
+
+
+def _view(options: argparse.Namespace) -> None:
+    if options.demo == bool(options.source):
+        raise UserError("give either CKPT or RESULTS, or --demo; see nlt view --help")
+    from nlt.view.page import view
+
+    view(options.source, options.scene, options.host, options.port, options.resolution)
 
 
 def _scenes(options: argparse.Namespace) -> None:
@@ -244,6 +255,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("--photons", type=positive, default=10000, help="number of input photons (default: 10000)")
     _add_render(commands.add_parser("render", help="render a video with a trained method next to path tracing"))
+    _add_view(commands.add_parser("view", help="explore a scene in the browser, drawn by trained methods"))
     select = commands.add_parser("select", help="find the smallest model that suffices for a scene, within minutes")
     select.add_argument("--config", required=True, help="ladder in configs/select, by name or path")
     select.add_argument("--minutes", type=float, help="time limit of measuring and training (default: the ladder's)")
@@ -291,6 +303,24 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         "--spp", type=_spp, help="samples per pixel of path tracing; 0 omits it (default: equal, at equal time)"
     )
     parser.add_argument("--photons", type=positive, help="number of input photons (default: as in training)")
+    parser.add_argument("--exr", action="store_true", help="also write each frame as a multi-layer EXR into the folder")
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "source", nargs="?", metavar="CKPT|RESULTS",
+        help="checkpoint, NAME.safetensors from nlt export, or results directory of nlt compare",
+    )  # fmt: skip
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help=f"{_SCENE} (default: the first of the training)")
+    parser.add_argument("--demo", action="store_true", help="use the model that comes with nlt")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine)")
+    parser.add_argument(
+        "--port", type=_whole, default=8080, help="port to listen at; 0 takes a free one (default: 8080)"
+    )
+    parser.add_argument(
+        "--resolution", type=positive, default=256,
+        help="most pixels of a picture, as the side of a square (default: 256)",
+    )  # fmt: skip
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:

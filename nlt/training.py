@@ -12,12 +12,13 @@ import lightning as L
 import yaml
 from jsonargparse import ArgumentError
 from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from PIL import Image
 
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
+from nlt.data.files import write_bytes
 from nlt.display import display
 from nlt.errors import UserError
 from nlt.models.clouds import CloudMethod
@@ -64,10 +65,14 @@ class Checkpoints(ModelCheckpoint):
 
 
 class Predictions(BasePredictionWriter):
-    """Writes the images of `nlt predict` as displayed to predictions/ in the run's directory, by sample index."""
+    """Writes the images of `nlt predict` as displayed to predictions/ in the run's directory, by sample index.
+
+    With `exr`, it also writes multi-layer EXRs, whose reference is the mean of the two halves.
+    """
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
+        self.exr = False
 
     def on_predict_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self.directory = Path(trainer.log_dir or trainer.default_root_dir) / "predictions"
@@ -79,6 +84,14 @@ class Predictions(BasePredictionWriter):
         images = (255 * display(prediction, batch["exposure"])).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         for index, image in zip(batch["index"].tolist(), images, strict=True):
             Image.fromarray(image).save(self.directory / f"{index:07d}.png")
+        if self.exr:
+            from nlt.rendering.exr import GBUFFER, exr  # here, because it needs Mitsuba
+
+            layers = {"radiance": prediction, **{name: batch[name] for name in GBUFFER}}
+            layers["reference"] = (batch["reference_a"] + batch["reference_b"]) / 2
+            for row, index in enumerate(batch["index"].tolist()):
+                content = exr({name: images[row].float().cpu().numpy() for name, images in layers.items()})
+                write_bytes(self.directory / f"{index:07d}.exr", content)
 
     def on_predict_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if trainer.is_global_zero:
@@ -87,6 +100,12 @@ class Predictions(BasePredictionWriter):
 
 class NLTCLI(LightningCLI):
     """LightningCLI in subclass mode, for one DataModule and any method."""
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand == "predict":
+            parser.add_argument("--exr", action="store_true", help="also write multi-layer EXRs")
+        return parser
 
     def before_instantiate_classes(self) -> None:
         """Tell a method with points their number; a linked argument would reach methods without points, too."""
@@ -114,6 +133,12 @@ class NLTCLI(LightningCLI):
         """Instantiate the classes and report errors of the model or trainer as user errors."""
         try:
             super().instantiate_classes()
+            if self.subcommand == "predict" and self.config.predict.exr:
+                self.datamodule.gbuffer = True
+                trainer: Any = self.trainer
+                for callback in trainer.callbacks:
+                    if isinstance(callback, Predictions):
+                        callback.exr = True
         except (ValueError, MisconfigurationException) as error:
             raise UserError(_one_line(str(error))) from None
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -204,6 +207,21 @@ def first_hit(triangles, origins, directions):
         results.append((t[k], k, (1 - u[k] - v[k], u[k], v[k])))
     t, which, weights = zip(*results, strict=True)
     return np.array(t), np.array(which), np.array(weights)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless chromium."""
+    from playwright.sync_api import sync_playwright  # here, because few tests need it
+
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if path is None:
+        pytest.fail("no chromium: run scripts/system-packages.sh chromium, or apt-get install chromium")
+    with sync_playwright() as playwright:
+        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+        browser = playwright.chromium.launch(executable_path=path, args=arguments)
+        yield browser
+        browser.close()
 
 
 def pytest_collection_modifyitems(items):

@@ -1,7 +1,10 @@
 """Training and evaluation through the command line's parser, on a tiny dataset."""
 
+from pathlib import Path
+
 import lightning as L
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 import yaml
@@ -199,6 +202,22 @@ def test_evaluation_commands(tiny, checkpoint, tmp_path, monkeypatch, capsys):
     exposed = np.clip(radiance * batch["exposure"].item(), 0, 1)
     srgb = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
     assert np.abs(np.asarray(Image.open(images[2])) - 255 * srgb).max() <= 0.51
+
+    place[1] = f"--trainer.default_root_dir={tmp_path / 'layers'}"
+    assert main(tiny.command("predict", "cnn", *place, "--trainer.precision=32-true", "--exr")) == 0
+    folder = Path(capsys.readouterr().out.split()[-1])
+    assert (folder / images[2].name).read_bytes() == images[2].read_bytes()
+    with OpenEXR.File(str(folder / "0000002.exr"), separate_channels=True) as file:
+        found = {name: channel.pixels for name, channel in file.channels().items()}
+    reference = (batch["reference_a"] + batch["reference_b"])[0] / 2
+    np.testing.assert_allclose(found["G"], radiance[..., 1], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found["Reference.B"], reference[2], rtol=1e-6)
+    for name, field, channel in (
+        ("Depth.Z", "depth", 0),
+        ("Denoising Normal.Y", "normal", 1),
+        ("Emit.R", "emission", 0),
+    ):
+        np.testing.assert_array_equal(found[name], batch[field][0, channel])
 
 
 def test_an_easy_task_is_learnt(tiny, tmp_path):

@@ -89,6 +89,7 @@ class LightTransportDataModule(L.LightningDataModule):
         self.online, self.passes, self.train_images = online, 0, train_images
         self.num_scenes = len(dataset.scenes)
         self.stored = dataset.without_train() if online else dataset
+        self.gbuffer = False  # whether samples have the whole G-buffer, whatever the method reads
         self.directory: AnyPath | None = None
         self.point_checksums: list[int] = []
 
@@ -125,6 +126,8 @@ class LightTransportDataModule(L.LightningDataModule):
         assert self.directory is not None, "call setup first"
         module = getattr(self.trainer, "lightning_module", None)
         fields = getattr(module, "fields", None)
+        if fields and self.gbuffer:
+            fields = (*fields, "albedo", "normal", "depth", "emission")
         if self.online and name == "train":
             from nlt.data.online import OnlineDataset  # here, because it needs Mitsuba
 

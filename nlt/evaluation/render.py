@@ -8,7 +8,8 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.paths import find_config
+from nlt.rendering.exr import GBUFFER, exr
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
 from nlt.scenes.state import SceneState
@@ -52,14 +54,23 @@ class ModelRenderer:
     """Renders frames with a trained method; what does not depend on the camera is reused until the state changes.
 
     `scene` is the scene's index in `spec`. Photons have the same seed in all states, so that they follow a moving
-    light without flicker.
+    light without flicker. Several methods may share the `render` of one scene. `seconds` holds the seconds of each
+    stage since it was last cleared.
     """
 
-    def __init__(self, method: RenderingModule, spec: DatasetSpec, scene: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        method: RenderingModule,
+        spec: DatasetSpec,
+        scene: int,
+        device: torch.device,
+        render: SampleRenderer | None = None,
+    ) -> None:
         self.spec, self.scene, self.device = spec, scene, device
-        self.render = SampleRenderer(spec, scene)
+        self.render = render or SampleRenderer(spec, scene)
         self.method = method.to(device).eval()
-        self.moving = MovingCamera(self.method)
+        self.seconds: dict[str, float] = {}
+        self.moving = MovingCamera(self.method, self.stage)
         self._seeds = np.random.SeedSequence([_MODEL])
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
@@ -78,13 +89,19 @@ class ModelRenderer:
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """Return the fields of a frame that the method reads, as a batch of one."""
         images = {*self.method.fields} & {"depth", "normal", "albedo", "emission", "noisy_input"}
-        sparse = self.method.pixel_fraction < 1
+        sparse = 0 < self.method.pixel_fraction < 1
         images -= {"noisy_input"} if sparse else set()
         self._set_state(state)
         if state.key != self._key:
-            self._state = self.render.view(camera, self._seeds, self._state_fields)
+            with self.stage("photons"):
+                self._state = self.render.view(camera, self._seeds, self._state_fields)
             self._key = state.key
-        view = self.render.view(camera, self._seeds, {*images, "camera_matrix", "world_to_view"})
+        with self.stage("gbuffer"):
+            fields = {*images, "camera_matrix", "world_to_view"} - {"noisy_input"}
+            view = self.render.view(camera, self._seeds, fields)
+        if "noisy_input" in images:
+            with self.stage("path_tracing"):
+                view |= self.render.view(camera, self._seeds, {"noisy_input"})
         tensors = self._tensors(self.scene, self._state | view)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
         batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
@@ -95,7 +112,8 @@ class ModelRenderer:
         mask = self.method.mask(batch, camera.height, camera.width)[0, 0].cpu().numpy()
         image = np.zeros((3, *mask.shape), np.float32)
         seed = int(self._seeds.generate_state(1)[0])
-        image[:, mask] = self.render.radiance(camera, self.spec.input_spp, seed, np.flatnonzero(mask))
+        with self.stage("path_tracing"):
+            image[:, mask] = self.render.radiance(camera, self.spec.input_spp, seed, np.flatnonzero(mask))
         return torch.from_numpy(image)[None].to(self.device)
 
     def _set_state(self, state: SceneState) -> None:
@@ -110,7 +128,45 @@ class ModelRenderer:
         """Return path-traced radiance (1, 3, H, W)."""
         self._set_state(state)
         (seed,) = np.random.SeedSequence([_TRACED, frame]).generate_state(1)
-        return torch.from_numpy(self.render.radiance(camera, spp, int(seed)))[None]
+        with self.stage("path_tracing"):
+            return torch.from_numpy(self.render.radiance(camera, spp, int(seed)))[None]
+
+    def gbuffer(self, state: SceneState, camera: Camera) -> dict[str, np.ndarray]:
+        """Return the G-buffer: depth (1, H, W), and albedo, normal and emission (3, H, W)."""
+        self._set_state(state)
+        with self.stage("gbuffer"):
+            return self.render.view(camera, self._seeds, GBUFFER)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the seconds that the context takes to those of a stage."""
+        start = time.perf_counter()
+        yield
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def open_model(
+    checkpoint: str,
+    trained: tuple[RenderingModule, DatasetSpec, list[int]],
+    index: int,
+    render: SampleRenderer | None = None,
+) -> ModelRenderer:
+    """Return the renderer of a method that `load_trained` has loaded, on the default device and by its fast paths.
+
+    Raises:
+        UserError: the method has embeddings of other points than those of the scene `index` here.
+    """
+    method, spec, checksums = trained
+    device = default_device()
+    model = ModelRenderer(accelerate(method, Policy.for_device(device), device), spec, index, device, render)
+    if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[index]:
+        raise UserError(
+            f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
+            f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
+        )
+    return model
 
 
 def render(
@@ -125,6 +181,7 @@ def render(
     fps: int = 24,
     spp: int | None = None,
     photons: int | None = None,
+    layers: bool = False,
 ) -> Path:
     """Write a video of a scene: the method left, path tracing right, captions with the measured time per frame.
 
@@ -139,6 +196,7 @@ def render(
         resolution: width and height of each of the two images.
         spp: samples per pixel of path tracing; None for as many as the method's time allows, 0 for no path tracing.
         photons: number of photons to cast (default: as in the dataset).
+        layers: also write a multi-layer EXR (nlt/rendering/exr.py) of each frame; the output must be a folder.
 
     Raises:
         UserError: a file is missing or wrong, the scene does not suit the method, or the folder has other files.
@@ -146,9 +204,11 @@ def render(
     provenance, video = origin(), output.endswith(".mp4")
     if not video and Path(output).suffix:
         raise UserError(f"-o: must be NAME.mp4 or a folder for PNGs, is {output!r}")
+    if video and layers:
+        raise UserError(f"--exr: -o must be a folder, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
     method, spec, checksums = load_trained(checkpoint)
-    spec, index = _with_scene(method, spec, scene, checkpoint)
+    spec, index = with_scene(method, spec, scene, checkpoint)
     spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
     description = spec.descriptions[index]
     views = cameras(description, camera_path, frames, *resolution)
@@ -162,25 +222,30 @@ def render(
     )
     manifest = _read_manifest(folder, key)
     names = [folder / f"{k:05d}.png" for k in range(frames)]
-    missing = [k for k, name in enumerate(names) if not name.exists()]
+    is_done = lambda name: name.exists() and (not layers or name.with_suffix(".exr").exists())
+    missing = [k for k, name in enumerate(names) if not is_done(name)]
     if missing:
-        device = default_device()
-        policy = Policy.for_device(device)
-        model = ModelRenderer(accelerate(method, policy, device), spec, index, device)
-        if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[index]:
-            raise UserError(
-                f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
-                f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
-            )
+        model = open_model(checkpoint, (method, spec, checksums), index)
+        policy = Policy.for_device(model.device)
         with torch.no_grad():
             if not manifest:
                 times = _measure(model, scene_states, views, spp)
-                manifest = {"key": key, **provenance, **surroundings(device, policy), "checkpoint": checkpoint, **times}
+                manifest = {
+                    "key": key,
+                    **provenance,
+                    **surroundings(model.device, policy),
+                    "checkpoint": checkpoint,
+                    **times,
+                }
                 manifest |= {"scene": scene, "experiment": spec.experiment, "frames": frames, "resolution": resolution}
                 write_bytes(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
             done = frames - len(missing)
             for k in tqdm(missing, "rendering", frames, unit="frame", file=sys.stderr, initial=done):
-                write_bytes(names[k], _frame_png(model, scene_states[k], views[k], k, description.exposure, manifest))
+                frame = _panels(model, scene_states[k], views[k], k, manifest)
+                write_bytes(names[k], _frame_png(frame, description.exposure, manifest))
+                if layers:
+                    content = exr(frame | model.gbuffer(scene_states[k], views[k]))
+                    write_bytes(names[k].with_suffix(".exr"), content)
     written = Path(output)
     if video:
         write_video(written, (np.asarray(Image.open(name)) for name in names), fps)
@@ -194,7 +259,7 @@ def render(
     return written
 
 
-def _with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoint: str) -> tuple[DatasetSpec, int]:
+def with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoint: str) -> tuple[DatasetSpec, int]:
     """Return a spec that has the scene, and the scene's index in it."""
     files = [find_config("scenes", name).resolve() for name in spec.scenes]
     file = find_config("scenes", scene).resolve()
@@ -268,27 +333,40 @@ def _seconds(work: Any, *arguments: Any) -> float:
     return time.perf_counter() - start
 
 
-def _frame_png(
-    model: ModelRenderer, state: SceneState, view: Camera, k: int, exposure: float, manifest: dict[str, Any]
-) -> bytes:
-    """Return a frame as a PNG of even size: the images next to each other, with captions below."""
-    panels = [(model.frame(state, view), f"{manifest['method']}, {_ms(manifest['model_ms'])}")]
+def _panels(
+    model: ModelRenderer, state: SceneState, view: Camera, k: int, manifest: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    """Return a frame's radiance (3, H, W) by the method and, unless its spp are 0, by path tracing."""
+    panels = {"radiance": model.frame(state, view)}
     if manifest["spp"]:
-        traced = model.traced(state, view, manifest["spp"], k)
-        panels.append((traced, f"path tracing, {manifest['spp']} spp, {_ms(manifest['path_tracing_ms'])}"))
-    width, height = len(panels) * view.width, view.height + _CAPTION
+        panels["path_tracing"] = model.traced(state, view, manifest["spp"], k)
+    return {name: image[0].cpu().numpy() for name, image in panels.items()}
+
+
+def _frame_png(images: dict[str, np.ndarray], exposure: float, manifest: dict[str, Any]) -> bytes:
+    """Return a frame as a PNG of even size: the images (3, H, W) next to each other, with captions below."""
+    captions = [f"{manifest['method']}, {_ms(manifest['model_ms'])}"]
+    if manifest["spp"]:
+        captions.append(f"path tracing, {manifest['spp']} spp, {_ms(manifest['path_tracing_ms'])}")
+    _, rows, columns = images["radiance"].shape
+    width, height = len(images) * columns, rows + _CAPTION
     sheet = Image.new("RGB", (width + width % 2, height + height % 2))
     draw = ImageDraw.Draw(sheet)
-    for column, (radiance, text) in enumerate(panels):
-        shown = display(radiance.cpu(), exposure)[0].permute(1, 2, 0).numpy()
-        sheet.paste(Image.fromarray((shown * 255).round().astype(np.uint8)), (column * view.width, 0))
+    for column, (radiance, text) in enumerate(zip(images.values(), captions, strict=True)):
+        sheet.paste(Image.fromarray(shown(radiance, exposure)), (column * columns, 0))
         size = 12.0
-        while draw.textlength(text, font_size=size) > view.width - 4 and size > 4:
+        while draw.textlength(text, font_size=size) > columns - 4 and size > 4:
             size -= 0.5
-        draw.text((column * view.width + 2, view.height + 3), text, "white", font_size=size)
+        draw.text((column * columns + 2, rows + 3), text, "white", font_size=size)
     file = io.BytesIO()
     sheet.save(file, "PNG")
     return file.getvalue()
+
+
+def shown(radiance: np.ndarray, exposure: float) -> np.ndarray:
+    """Return radiance (3, H, W) as displayed: sRGB (H, W, 3) uint8."""
+    srgb = display(torch.from_numpy(radiance)[None], exposure)[0].permute(1, 2, 0)
+    return (srgb.numpy() * 255).round().astype(np.uint8)
 
 
 def write_video(path: Path, images: Iterable[np.ndarray], fps: int) -> None:

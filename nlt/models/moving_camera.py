@@ -1,5 +1,7 @@
 """Further views of a scene state, without recomputing what does not depend on the camera."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -12,11 +14,14 @@ from nlt.models.module import RenderingModule
 class MovingCamera:
     """A trained method at inference that reuses its light transport while the scene's state stays the same.
 
-    A further view then costs only the G-buffer, projection and synthesis, and its image is bitwise identical.
+    A further view then costs only the G-buffer, projection and synthesis, and its image is bitwise identical. Each step
+    runs in the context `stage(name)`, for example a stopwatch.
     """
 
-    def __init__(self, method: RenderingModule) -> None:
-        self.method = method.eval()
+    def __init__(
+        self, method: RenderingModule, stage: Callable[[str], AbstractContextManager[Any]] = nullcontext
+    ) -> None:
+        self.method, self.stage = method.eval(), stage
         self._state: Batch = {}
         self._transported: Any = None
 
@@ -26,6 +31,10 @@ class MovingCamera:
         steps = self.method.steps()
         state = {name: batch[name] for name in self.method.state_inputs}
         if state.keys() != self._state.keys() or not all(torch.equal(state[name], self._state[name]) for name in state):
-            self._transported = steps["transport"](state, None)
+            with self.stage("transport"):
+                self._transported = steps["transport"](state, None)
             self._state = {name: value.clone() for name, value in state.items()}  # the batch may change in place
-        return steps["synthesis"](batch, steps["projection"](batch, self._transported))
+        with self.stage("projection"):
+            features = steps["projection"](batch, self._transported)
+        with self.stage("synthesis"):
+            return steps["synthesis"](batch, features)

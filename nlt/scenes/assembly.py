@@ -93,7 +93,8 @@ class Scene:
         self._assemble(meshes)
         self.masks = any(is_mask(shape.bsdf) for shape in self.shapes.values())
         vertices = {m.name: np.concatenate([self.shapes[name].vertices for name in m.shapes]) for m in self.movables}
-        self._centres = {name: (v.min(0) + v.max(0)) / 2 for name, v in vertices.items()}
+        # The middles (3,) in metres of the movable objects at rest.
+        self.centres = {name: (v.min(0) + v.max(0)) / 2 for name, v in vertices.items()}
         self.set_state(rest_state(description, experiment))
 
     def _assemble(self, meshes: dict[str, Any]) -> None:
@@ -161,7 +162,7 @@ class Scene:
         self.state = state
         units = self.description.units_per_metre
         for movable, translation, present in zip(self.movables, state.translation, state.present, strict=True):
-            centre = self._centres[movable.name] * units
+            centre = self.centres[movable.name] * units
             offset, scale = translation.astype(float) * units, 1.0 if present else _SPECK
             if movable.name == MOVING_LIGHT:
                 transform = self._light_transform(translation.astype(float), scale)

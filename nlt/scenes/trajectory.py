@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import yaml
 from pydantic import Field
 from scipy.interpolate import PchipInterpolator
 
@@ -126,3 +127,23 @@ def states(
     for moment, position in zip(moved, positions, strict=True):
         moment.translation[names.index(MOVING_LIGHT)] = position - description.light.centre
     return moved
+
+
+def write_state(description: SceneDescription, experiment: str, state: SceneState) -> str:
+    """Return a YAML file from which `states` reads this state; lengths in metres."""
+    content: dict[str, Any] = {"objects": {}}
+    rows = zip(description.movables(experiment), state.translation.astype(float), state.present, strict=True)
+    for movable, translation, present in rows:
+        if movable.name == MOVING_LIGHT:
+            assert description.light is not None  # otherwise movables() raises
+            content["light"] = [(description.light.centre + translation).tolist()]
+        else:
+            content["objects"][movable.name] = translation.tolist() if present else "removed"
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+def write_camera(camera: Camera) -> str:
+    """Return a YAML file from which `cameras` reads this camera as the only view of a path; lengths in metres."""
+    target = camera.position + camera.rotation[:, 2]
+    views = [{"position": camera.position.tolist(), "target": target.tolist()}]
+    return yaml.safe_dump({"views": views, "fov": camera.fov}, sort_keys=False, default_flow_style=None)

@@ -33,7 +33,7 @@ class ViewPerturber:
         room = self.description.room
         self.middle = (self.description.camera if room is None else room).mean(0)
         self.light: Any = self.description.light  # None unless there is a moving light
-        self.centres = [self.scene._centres[m.name] for m in self.scene.movables]  # at rest
+        self.centres = [self.scene.centres[m.name] for m in self.scene.movables]  # at rest
         self.objects = np.array([m.name != MOVING_LIGHT for m in self.scene.movables], bool)
         self._emitter: Any = {}  # the moving light's, if there is one
         if not self.objects.all():

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import av
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 import yaml
@@ -21,11 +22,12 @@ from nlt.data.render import SampleRenderer
 from nlt.data.store import points_name, read_points, write_shard
 from nlt.display import display
 from nlt.evaluation.export import load_trained, save_trained
-from nlt.evaluation.render import DEMO, ModelRenderer, _with_scene, render, write_video
+from nlt.evaluation.render import DEMO, ModelRenderer, render, shown, with_scene, write_video
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy, accelerate
 from nlt.rendering.renderer import Renderer
-from nlt.scenes.trajectory import cameras, follow, states, turn
+from nlt.scenes.state import sample_state
+from nlt.scenes.trajectory import cameras, follow, states, turn, write_camera, write_state
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -110,7 +112,7 @@ def test_traces_only_the_pixels_that_the_method_looks_at():
 
 def test_without_embeddings_any_scene_will_do():
     method = NeuralLightTransport(use_points=False, use_photons=True, width=2, depth=1)
-    assert _with_scene(method, spec_of(), "bedroom", "a.ckpt")[0].scenes == ["bedroom"]
+    assert with_scene(method, spec_of(), "bedroom", "a.ckpt")[0].scenes == ["bedroom"]
 
 
 def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
@@ -132,6 +134,47 @@ def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
     assert main([*map(str, arguments), "--state", "1"]) == 2
     assert "another command" in capsys.readouterr().err
     assert (folder / "00001.png").read_bytes() == red
+
+
+def test_layers_of_frames(models, tmp_path, refused):
+    """The PNG shows the EXR's radiance; a frame whose EXR is missing is made again, and no other."""
+    ask = ["render", str(models.splat), "living_room", "--frames", "2", "--resolution", "24x16", "--spp", "2"]
+    refused([*ask, "--exr", "-o", "video.mp4"], "--exr", "folder")
+    assert main([*ask, "-o", "frames"]) == 0
+    before = [pixels(tmp_path / f"frames/0000{k}.png") for k in range(2)]
+    assert main([*ask, "-o", "frames", "--exr"]) == 0
+    model = ModelRenderer(*load_trained(str(models.splat))[:2], 0, CPU)
+    exposure = model.render.description.exposure
+    for k, view in enumerate(cameras(model.render.description, "turntable", 2, 24, 16)):
+        (moment,) = states(model.render.description, "moving_lights", "0", None, 1)
+        with OpenEXR.File(str(tmp_path / f"frames/0000{k}.exr"), separate_channels=True) as file:
+            found = {name: channel.pixels for name, channel in file.channels().items()}
+        layer = lambda *names: np.stack([found[name] for name in names])  # noqa: B023
+        sheet = [shown(layer(*(f"{p}{c}" for c in "RGB")), exposure) for p in ("", "Noisy Image.")]
+        assert (pixels(tmp_path / f"frames/0000{k}.png") == before[k]).all()
+        assert (before[k][:16] == np.concatenate(sheet, 1)).all()
+        model.render.scene.set_state(moment)
+        buffers = model.render.renderer.gbuffer(view)
+        np.testing.assert_array_equal(found["Depth.Z"], buffers["depth"][0])
+        for name, channels in (("albedo", "RGB"), ("normal", "XYZ")):
+            stored = layer(*(f"Denoising {name.capitalize()}.{c}" for c in channels))
+            np.testing.assert_allclose(stored, buffers[name], atol=1e-3)
+        np.testing.assert_array_equal(layer(*(f"Emit.{c}" for c in "RGB")), buffers["emission"])
+    (tmp_path / "frames/00000.exr").unlink()
+    kept = (tmp_path / "frames/00001.exr").stat().st_mtime_ns
+    assert main([*ask, "-o", "frames", "--exr"]) == 0
+    assert (tmp_path / "frames/00000.exr").exists() and (tmp_path / "frames/00001.exr").stat().st_mtime_ns == kept
+
+
+def test_without_noisy_input_nothing_is_traced(models, monkeypatch):
+    traced = []
+    monkeypatch.setattr(SampleRenderer, "radiance", lambda *arguments: traced.append(arguments))
+    model = ModelRenderer(*load_trained(str(models.splat))[:2], 0, CPU)
+    description = model.render.description
+    (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
+    with torch.no_grad():
+        model.frame(moment, view)
+    assert not traced and {"gbuffer", "photons", "projection", "synthesis"} <= model.seconds.keys()
 
 
 def test_checkpoint_export_and_video(tiny, checkpoint, tmp_path, capsys):
@@ -213,6 +256,20 @@ def test_follow_passes_its_keys():
     np.testing.assert_allclose(around[::10], keys)
     np.testing.assert_allclose(follow(np.roll(keys, -2, 0), 50, closed=True), np.roll(around, -20, 0))
     assert (follow(keys[:1], 3, closed=True) == keys[0]).all()
+
+
+def test_written_states_and_views_are_read_back(demo, tmp_path):
+    """The very state, of random ones in each experiment and of the light; the camera to within rounding."""
+    for experiment in ("static", "fixed_lights", "moving_lights"):
+        for seed in range(5):
+            moment = sample_state(demo, experiment, np.random.default_rng(seed))
+            path = write(tmp_path / "s.yaml", write_state(demo, experiment, moment))
+            assert states(demo, experiment, str(path), None, 1)[0].key == moment.key
+    for view in cameras(demo, "turntable", 3, 30, 20):
+        path = write(tmp_path / "c.yaml", write_camera(view))
+        (again,) = cameras(demo, str(path), 1, 30, 20)
+        np.testing.assert_allclose(again.matrix, view.matrix, rtol=1e-6)
+        np.testing.assert_allclose(again.world_to_view, view.world_to_view, atol=1e-6)
 
 
 def test_files_of_states_and_views(demo, tmp_path):

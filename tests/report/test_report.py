@@ -6,7 +6,6 @@ import html.parser
 import io
 import json
 import math
-import os
 import re
 import shutil
 from types import SimpleNamespace
@@ -17,7 +16,6 @@ import torch
 from made_results import ODD, TROUBLED, make_results, make_troubled_results, papers_numbers, time_elsewhere
 from matplotlib import colormaps
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
 from nlt.display import display
 from nlt.evaluation.paper import label, published
@@ -261,18 +259,6 @@ def test_packing_fits():
 
 
 # ---- the page ----
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if path is None:
-        pytest.fail("no chromium: run scripts/system-packages.sh chromium, or apt-get install chromium")
-    with sync_playwright() as playwright:
-        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-        browser = playwright.chromium.launch(executable_path=path, args=arguments)
-        yield browser
-        browser.close()
 
 
 class Report(SimpleNamespace):

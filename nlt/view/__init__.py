@@ -1,0 +1,1 @@
+"""`nlt view`: a scene in the browser, drawn by trained methods, Open Image Denoise and path tracing."""
