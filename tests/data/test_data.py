@@ -93,9 +93,9 @@ def test_spec_is_written_as_ever():
     """The name of a dataset's directory is a hash of these bytes."""
     written = json.dumps(dataclasses.asdict(DatasetSpec(["living_room"], reference_mse=0)), sort_keys=True)
     assert written == (
-        '{"experiment": "moving_lights", "input_spp": 4, "integrator": "scene", "noisy_spp": 1, "num_photons": 10000, '
-        '"num_points": 10000, "reference_mse": 0.0, "reference_spp": 64, "resolution": 64, "scenes": ["living_room"], '
-        '"seed": 0, "shard_size": 64, "test": 64, "train": 1000, "val": 16}'
+        '{"crop": 0, "experiment": "moving_lights", "input_spp": 4, "integrator": "scene", "noisy_spp": 1, '
+        '"num_photons": 10000, "num_points": 10000, "reference_mse": 0.0, "reference_spp": 64, "resolution": 64, '
+        '"scenes": ["living_room"], "seed": 0, "shard_size": 64, "test": 64, "train": 1000, "val": 16}'
     )
 
 
