@@ -43,7 +43,12 @@ def test_copies_are_as_they_stand():
     script = runpy.run_path(str(PROJECT / "scripts/update_readme.py"))
     assert set(script["PAGES"]) <= set(PAGES)
     copied = "".join(page.read_text() for page in script["PAGES"])
-    for source in ("results/real_living_room/table.md", "nlt/data/sample.py FIELDS", "scripts/paper_scale.py", *STUDIES):
+    for source in (
+        "results/real_living_room/table.md",
+        "nlt/data/sample.py FIELDS",
+        "scripts/paper_scale.py",
+        *STUDIES,
+    ):
         assert f"<!-- {source} -->" in copied
     assert script["update"](copied) == copied
     forged = copied.replace("first half of the reference", "a number of someone's")
