@@ -19,6 +19,7 @@ from PIL import Image
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.files import write_bytes
+from nlt.data.sample import BUFFERS
 from nlt.display import display
 from nlt.errors import UserError
 from nlt.models.clouds import CloudMethod
@@ -85,9 +86,9 @@ class Predictions(BasePredictionWriter):
         for index, image in zip(batch["index"].tolist(), images, strict=True):
             Image.fromarray(image).save(self.directory / f"{index:07d}.png")
         if self.exr:
-            from nlt.rendering.exr import GBUFFER, exr  # here, because it needs Mitsuba
+            from nlt.rendering.exr import exr  # here, because it needs Mitsuba
 
-            layers = {"radiance": prediction, **{name: batch[name] for name in GBUFFER}}
+            layers = {"radiance": prediction, **{name: batch[name] for name in BUFFERS}}
             layers["reference"] = (batch["reference_a"] + batch["reference_b"]) / 2
             for row, index in enumerate(batch["index"].tolist()):
                 content = exr({name: images[row].float().cpu().numpy() for name, images in layers.items()})

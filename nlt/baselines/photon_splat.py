@@ -67,10 +67,11 @@ class PhotonSplat(CloudMethod):
         arrived = torch.where(depth > 0, total(carried, pixels, *depth.shape[-2:]), 0)
         sums = torch.cat([arrived, seen_area(batch)], dim=1)
         chosen = sums
-        table = F.pad(sums.double().cumsum(2).cumsum(3), (1, 0, 1, 0))  # in float32, differences would lose digits
-        for radius in _RADII if self.hparams["footprint"] else ():
-            wider = box_sums(table, radius).to(sums.dtype)
-            chosen = torch.where(chosen[:, 3:4] < self.hparams["footprint"], wider, chosen)
+        if self.hparams["footprint"]:
+            table = F.pad(sums.double().cumsum(2).cumsum(3), (1, 0, 1, 0))  # in float32, differences would lose digits
+            for radius in _RADII:
+                wider = box_sums(table, radius).to(sums.dtype)
+                chosen = torch.where(chosen[:, 3:4] < self.hparams["footprint"], wider, chosen)
         return torch.where(depth > 0, chosen[:, :3] / chosen[:, 4:], 0)
 
     def features(self, batch: Batch, transported: Any = None) -> Tensor:

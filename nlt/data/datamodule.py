@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Sampler
 from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, identity_collate
 from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath
+from nlt.data.sample import BUFFERS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import check_dataset, points_crc, points_name, read_points
 from nlt.errors import UserError
@@ -127,7 +128,7 @@ class LightTransportDataModule(L.LightningDataModule):
         module = getattr(self.trainer, "lightning_module", None)
         fields = getattr(module, "fields", None)
         if fields and self.gbuffer:
-            fields = (*fields, "albedo", "normal", "depth", "emission")
+            fields = (*fields, *BUFFERS)
         if self.online and name == "train":
             from nlt.data.online import OnlineDataset  # here, because it needs Mitsuba
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from nlt.scenes.description import MATERIALS
 
-__all__ = ["BATCH_FIELDS", "FIELDS", "MATERIALS", "POINT_FIELDS", "SPLITS", "Field"]
+__all__ = ["BATCH_FIELDS", "BUFFERS", "FIELDS", "MATERIALS", "POINT_FIELDS", "SPLITS", "Field"]
 
 SPLITS = ("train", "val", "test")
 
@@ -66,6 +66,8 @@ FIELDS: dict[str, Field] = {
     "translation": Field(("M", 3), "float32", "m", "translation of each object from its place in the scene file"),
     "present": Field(("M",), "bool", "", "whether the movable object is in the scene"),
 }
+
+BUFFERS = ("depth", "normal", "albedo", "emission")  # fields that one noise-free pass of primary rays gives
 
 POINT_FIELDS: dict[str, Field] = {
     "position": Field(("N", 3), "float32", "m", "position with every object at its place in the scene file"),

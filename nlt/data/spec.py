@@ -108,7 +108,8 @@ class DatasetSpec:
     @property
     def points_nbytes(self) -> int:
         """The size of one scene's points on disk in bytes."""
-        return sum(field.nbytes(self.sizes("test")) for field in POINT_FIELDS.values())
+        sizes = self.sizes("test")
+        return sum(field.nbytes(sizes) for field in POINT_FIELDS.values())
 
     def nbytes(self, split: str) -> int:
         """Return the size of one sample on disk in bytes."""

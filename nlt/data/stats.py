@@ -15,7 +15,7 @@ from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB
 from nlt.data.render import SampleRenderer
-from nlt.data.sample import FIELDS
+from nlt.data.sample import BUFFERS, FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
@@ -26,7 +26,7 @@ STAGES = {
     "state, view": ("camera_matrix", "world_to_view", "translation", "present"),
     "noisy": ("noisy",),
     "noisy_input": ("noisy_input",),
-    "G-buffer": ("depth", "normal", "albedo", "emission"),
+    "G-buffer": BUFFERS,
     "photons": ("photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid"),
     "reference": ("reference_a", "reference_b"),
     "storing": (),

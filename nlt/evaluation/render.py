@@ -23,6 +23,7 @@ from tqdm import tqdm
 from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
+from nlt.data.sample import BUFFERS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, points_crc, points_name, read_points
 from nlt.display import display
@@ -34,7 +35,7 @@ from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.paths import find_config
-from nlt.rendering.exr import GBUFFER, exr
+from nlt.rendering.exr import exr
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
 from nlt.scenes.state import SceneState
@@ -88,7 +89,7 @@ class ModelRenderer:
 
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """Return the fields of a frame that the method reads, as a batch of one."""
-        images = {*self.method.fields} & {"depth", "normal", "albedo", "emission", "noisy_input"}
+        images = {*self.method.fields} & {*BUFFERS, "noisy_input"}
         sparse = 0 < self.method.pixel_fraction < 1
         images -= {"noisy_input"} if sparse else set()
         self._set_state(state)
@@ -135,7 +136,7 @@ class ModelRenderer:
         """Return the G-buffer: depth (1, H, W), and albedo, normal and emission (3, H, W)."""
         self._set_state(state)
         with self.stage("gbuffer"):
-            return self.render.view(camera, self._seeds, GBUFFER)
+            return self.render.view(camera, self._seeds, BUFFERS)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nlt.data.sample import MATERIALS
 from nlt.models.clouds import CloudMethod
 from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, log_exposed
-from nlt.models.projection import average_rows, visible_pixels
+from nlt.models.projection import average_rows, visible_pixels, visible_rows
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
 POINT_ATTRIBUTES = 3 + len(MATERIALS) + 3 + 3 + 1  # position, material, albedo, emission, visibility
@@ -99,8 +99,5 @@ class NeuralLightTransport(CloudMethod):
         """Return the photons' map (B, photon_width, H, W), computing features only for photons that the view sees."""
         images, _, height, width = batch["depth"].shape
         view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
-        pixels = visible_pixels(batch["photon_hit"], batch["photon_valid"], **view)
-        seen = pixels < height * width
-        first = height * width * torch.arange(images, device=pixels.device)[:, None]
-        rows = self.photon_network(self._photons(batch)[seen])
-        return average_rows(rows, (pixels + first)[seen], images, height, width)
+        seen, at = visible_rows(visible_pixels(batch["photon_hit"], batch["photon_valid"], **view), height, width)
+        return average_rows(self.photon_network(self._photons(batch)[seen]), at, images, height, width)

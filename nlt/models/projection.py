@@ -95,6 +95,16 @@ def _tangent_planes(to_pixels: Tensor, depth: Tensor, normal: Tensor, column: Te
     return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit is infinitely far
 
 
+def visible_rows(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return which points are visible, (B, N) bool, and their pixels (M,): (image * height + row) * width + column.
+
+    `pixels` (B, N) are those of `visible_pixels`.
+    """
+    visible = pixels < height * width
+    first = height * width * torch.arange(len(pixels), device=pixels.device)[:, None]
+    return visible, (pixels + first)[visible]
+
+
 def total(features: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
     """Return the sum (B, C, H, W) of features (B, N, C) in each pixel; `pixels` (B, N) as from `visible_pixels`."""
     batch, _, channels = features.shape
@@ -126,8 +136,7 @@ def average_rows(rows: Tensor, pixels: Tensor, batch: int, height: int, width: i
 
 def average_sparsely(features: Tensor, pixels: Tensor, height: int, width: int) -> SparseMap:
     """Return the same means as `average`, with a row for each pixel in which a point is visible."""
-    visible = pixels < height * width
-    at = (pixels + height * width * torch.arange(len(pixels), device=pixels.device)[:, None])[visible]
+    visible, at = visible_rows(pixels, height, width)
     seen, row, count = at.unique(return_inverse=True, return_counts=True)
     features = features[visible].to(torch.promote_types(features.dtype, torch.float32))  # as in `total`
     sums = features.new_zeros(len(seen), features.shape[1]).index_add_(0, row, features)
@@ -152,6 +161,5 @@ def project(
     height, width = depth.shape[-2:]
     if not features.requires_grad:  # an exported program has no shapes that depend on the data
         return average(features, pixels, height, width)
-    visible = pixels < height * width
-    first = height * width * torch.arange(len(pixels), device=pixels.device)[:, None]
-    return average_rows(features[visible], (pixels + first)[visible], len(pixels), height, width)
+    visible, at = visible_rows(pixels, height, width)
+    return average_rows(features[visible], at, len(pixels), height, width)

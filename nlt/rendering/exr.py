@@ -17,7 +17,6 @@ CHANNELS = {
     "path_tracing": ("Noisy Image.R", "Noisy Image.G", "Noisy Image.B"),
     "reference": ("Reference.R", "Reference.G", "Reference.B"),
 }
-GBUFFER = ("albedo", "normal", "depth", "emission")  # layers that are also fields of a sample
 
 
 def exr(layers: Mapping[str, np.ndarray]) -> bytes:
