@@ -126,7 +126,7 @@ class LightTransportDataModule(L.LightningDataModule):
         """Return the dataset of a split with the fields that the trainer's method needs, or all without a trainer."""
         assert self.directory is not None, "call setup first"
         module = getattr(self.trainer, "lightning_module", None)
-        fields = getattr(module, "fields", None)
+        fields = getattr(module, "training_fields", None)
         if fields and self.gbuffer:
             fields = (*fields, *BUFFERS)
         if self.online and name == "train":

@@ -67,6 +67,7 @@ FIELDS: dict[str, Field] = {
     "present": Field(("M",), "bool", "", "whether the movable object is in the scene"),
 }
 
+TRACED = ("noisy", "noisy_input")  # fields that path tracing gives and a method may read
 BUFFERS = ("depth", "normal", "albedo", "emission")  # fields that one noise-free pass of primary rays gives
 
 POINT_FIELDS: dict[str, Field] = {

@@ -105,6 +105,10 @@ class DatasetSpec:
         """Return the number of samples per scene in a split."""
         return int(getattr(self, split))
 
+    def samples(self, fields: Collection[str]) -> int:
+        """Return the samples per pixel of the path-traced image that is among a method's `fields`."""
+        return self.noisy_spp if "noisy" in fields else self.input_spp
+
     @property
     def points_nbytes(self) -> int:
         """The size of one scene's points on disk in bytes."""

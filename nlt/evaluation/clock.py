@@ -89,7 +89,7 @@ class Clock:
                 self._timed(seconds, "photons", partial(renderer.photons, count, index))
             if "path_tracing" in method.stages:
                 pixels = None if method.pixel_fraction == 1 else mask[row, 0].flatten().nonzero()[:, 0].cpu().numpy()
-                spp = method.spp or spec.input_spp
+                spp = method.spp or spec.samples(method.fields)
                 work = partial(renderer.radiance, camera, spp, index, pixels)
                 traced.append(self._timed(seconds, "path_tracing", work))
         if "traced" in method.fields:

@@ -95,7 +95,7 @@ def compare(
             metrics, view_rows, radiance = test.evaluate_once(module, folder / JUDGED, key)
             run |= clock.time(module) | metrics | clock.size(module) | facts
             run |= {"family": type(module).__name__, "pixel_fraction": module.pixel_fraction}
-            run["spp"] = (module.spp or spec.input_spp) if "path_tracing" in module.stages else 0
+            run["spp"] = (module.spp or spec.samples(module.fields)) if "path_tracing" in module.stages else 0
             views += [{"method": method, "seed": seed, **row} for row in view_rows]
             if seed == comparison.seeds[0]:
                 write_images(directory, method, radiance=radiance)

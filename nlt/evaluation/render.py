@@ -23,7 +23,7 @@ from tqdm import tqdm
 from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
-from nlt.data.sample import BUFFERS
+from nlt.data.sample import BUFFERS, TRACED
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, points_crc, points_name, read_points
 from nlt.display import display
@@ -89,20 +89,19 @@ class ModelRenderer:
 
     def batch(self, state: SceneState, camera: Camera) -> Batch:
         """Return the fields of a frame that the method reads, as a batch of one."""
-        images = {*self.method.fields} & {*BUFFERS, "noisy_input"}
+        names = {*self.method.fields}
         sparse = 0 < self.method.pixel_fraction < 1
-        images -= {"noisy_input"} if sparse else set()
+        traced = set() if sparse else names & {*TRACED}
         self._set_state(state)
         if state.key != self._key:
             with self.stage("photons"):
                 self._state = self.render.view(camera, self._seeds, self._state_fields)
             self._key = state.key
         with self.stage("gbuffer"):
-            fields = {*images, "camera_matrix", "world_to_view"} - {"noisy_input"}
-            view = self.render.view(camera, self._seeds, fields)
-        if "noisy_input" in images:
+            view = self.render.view(camera, self._seeds, {*(names & {*BUFFERS}), "camera_matrix", "world_to_view"})
+        if traced:
             with self.stage("path_tracing"):
-                view |= self.render.view(camera, self._seeds, {"noisy_input"})
+                view |= self.render.view(camera, self._seeds, traced)
         tensors = self._tensors(self.scene, self._state | view)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
         batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}

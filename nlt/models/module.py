@@ -146,6 +146,16 @@ class RenderingModule(Method, L.LightningModule):
         return (*self.inputs, "emission") if self.demodulates and self.hparams["add_emission"] else self.inputs
 
     @property
+    def target(self) -> str:
+        """The noisy image that training compares with: one that the method does not read, so that the noise differs."""
+        return "noisy_input" if "noisy" in self.inputs else "noisy"
+
+    @property
+    def training_fields(self) -> tuple[str, ...]:
+        """Names of the batch fields that a training step reads."""
+        return (*self.fields, self.target)
+
+    @property
     def state_inputs(self) -> tuple[str, ...]:
         """The batch fields that do not depend on the camera, which are all that `transport` may read."""
         return (*(name for name in self.inputs if name.startswith(("point_", "photon_"))), "scene", "exposure")
@@ -195,8 +205,12 @@ class RenderingModule(Method, L.LightningModule):
 
     # --- training and evaluation ---
 
+    def noisy_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
+        """Return the loss of a prediction (B, 3, H, W) against the noisy target."""
+        return self.loss(prediction, batch[self.target], batch["exposure"])
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss = self.loss(self(batch), batch["noisy"], batch["exposure"])
+        loss = self.noisy_loss(self(batch), batch)
         if not loss.isfinite():
             raise DivergedError(
                 f"train/loss is {loss.item()} at step {self.global_step}, in a batch of scenes "
@@ -252,7 +266,7 @@ class RenderingModule(Method, L.LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> Tensor:
         prediction = self._evaluation_step(batch)
         # Against the noisy target, to be comparable with train/loss.
-        loss = self.loss(prediction, batch["noisy"], batch["exposure"])
+        loss = self.noisy_loss(prediction, batch)
         self.log("val/loss", loss, batch_size=len(batch["scene"]))
         return prediction
 

@@ -51,7 +51,7 @@ class NeuralLightTransport(CloudMethod):
         points = tuple(f"point_{name}" for name in ("position", "visible", "material", "albedo", "emission"))
         photons = tuple(f"photon_{name}" for name in ("origin", "direction", "flux", "hit", "valid"))
         used = (points if self.hparams["use_points"] else ()) + (photons if self.hparams["use_photons"] else ())
-        return tuple(dict.fromkeys((*GBUFFER, *PROJECTION, *used)))
+        return tuple(dict.fromkeys((*GBUFFER, *(PROJECTION if used else ()), *used)))
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -161,7 +161,7 @@ class Search:
 
     def _step_s(self, module: RenderingModule) -> float:
         """Return the seconds of a training step: the least of two, after a warm-up step."""
-        data = self._split("train", module.fields)
+        data = self._split("train", module.training_fields)
         batch = default_collate([data[k % len(data)] for k in range(self._batch_size)])
         batch = {name: value.to(self.device) for name, value in batch.items()}
         module = module.to(self.device).train()
@@ -170,7 +170,7 @@ class Search:
         for _ in range(3):
             begin = now()
             with self.policy.autocast(self.device):
-                loss = module.loss(module(batch), batch["noisy"], batch["exposure"])
+                loss = module.noisy_loss(module(batch), batch)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

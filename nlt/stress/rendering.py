@@ -15,6 +15,7 @@ from nlt.data.dataset import SampleTensors
 from nlt.data.engines import Local, available_cpus
 from nlt.data.files import AnyPath, list_files, open_path
 from nlt.data.render import SampleRenderer
+from nlt.data.sample import TRACED
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name, read_points, write_shard
 from nlt.errors import UserError
@@ -28,7 +29,7 @@ from nlt.stress.suites import CLEAN, FLICKER, PATHS, RENDERED, Suites
 
 DRAWS = "draws"
 _FEWER_SPP = (1, 2, 3)  # samples per input pixel that the clean views are also rendered at
-_DRAWN = ("noisy_input", "photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid")
+_DRAWN = (*TRACED, "photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid")
 
 
 @dataclass(frozen=True)

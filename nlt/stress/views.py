@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import AnyPath
+from nlt.data.sample import TRACED
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points, ShardReader, read_points
 from nlt.display import expose
@@ -150,7 +151,7 @@ class SuiteViews:
                         moved = _with_nearest_embeddings(method, scene, before, after)
                         predictions.append(self.predict(moved, self._batch(clean_set, after)))
                     else:
-                        prefix = {"photons": "photon_", "noise": "noisy_input"}[kind]
+                        prefix = {"photons": "photon_", "noise": "noisy"}[kind]
                         drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
                         predictions.append(self.predict(method, clean | drawn))
                 images = torch.stack([expose(prediction, clean["exposure"]) for prediction in predictions])
@@ -196,5 +197,5 @@ def _reads(method: Method, change: str) -> bool:
     """Return whether a change of the inputs can affect a method."""
     if change == "pixels":
         return "one_in" in getattr(method, "hparams", ())
-    inputs = {"points": "point_visible", "photons": "photon_flux", "spp": "noisy_input", "noise": "noisy_input"}
-    return change not in inputs or inputs[change] in method.fields
+    inputs = {"points": {"point_visible"}, "photons": {"photon_flux"}, "spp": {"noisy_input"}, "noise": {*TRACED}}
+    return change not in inputs or not inputs[change].isdisjoint(method.fields)

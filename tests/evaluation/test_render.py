@@ -15,6 +15,7 @@ from PIL import Image
 from tiny import write
 
 from nlt.baselines.denoising import SparseDenoising
+from nlt.baselines.guided import GuidedOneSample
 from nlt.baselines.photon_splat import PhotonSplat
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
@@ -108,6 +109,18 @@ def test_traces_only_the_pixels_that_the_method_looks_at():
     noise = model.render.radiance(view, 64, 1) - whole.numpy()  # of as many samples, at all pixels
     assert (given - whole)[:, looked].square().mean() < 20 * np.square(noise).mean()
     assert given[:, looked].mean() == pytest.approx(whole[:, looked].mean().item(), rel=0.3)
+
+
+def test_traces_one_sample_for_the_method_that_reads_it():
+    """The frame's noisy image is the dataset's, at the same samples per pixel and of the same seed."""
+    model = ModelRenderer(GuidedOneSample(width=2, depth=1), spec_of(noisy_spp=2, input_spp=64), 0, CPU)
+    description = model.render.description
+    (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
+    batch = model.batch(moment, view)
+    assert "noisy_input" not in batch and model.seconds["path_tracing"] > 0
+    expected = model.render.radiance(view, 2, int(np.random.SeedSequence([0]).generate_state(1)[0]))
+    np.testing.assert_array_equal(batch["noisy"][0], expected)
+    assert model.spec.samples(model.method.fields) == 2 and model.spec.samples(("noisy_input",)) == 64
 
 
 def test_without_embeddings_any_scene_will_do():

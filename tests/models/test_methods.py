@@ -122,7 +122,7 @@ def test_doubled_exposure_of_halved_light(method):
     batch = synthetic_batch()
     method.eval()
     expected = method(batch) / 2
-    for name in ("noisy_input", "point_emission", "photon_flux"):
+    for name in ("noisy", "emission", "noisy_input", "point_emission", "photon_flux"):
         batch[name] = batch[name] / 2
     batch["exposure"] = batch["exposure"] * 2
     torch.testing.assert_close(method(batch), expected)
@@ -364,7 +364,7 @@ def test_sparse_maps_make_the_same_image(method, one_thread):
     """Only where pixels are many, and only in the accelerated copy."""
     double = lambda batch: {k: v.double() if v.is_floating_point() else v for k, v in batch.items()}
     batch, small = (double(synthetic_batch(size=size)) for size in (24, 7))
-    projects = isinstance(method, NeuralLightTransport | FeatureProjection)
+    projects = isinstance(method, NeuralLightTransport | FeatureProjection) and "camera_matrix" in method.inputs
     method = method.double().eval()
     with torch.no_grad():
         expected = method(batch)
@@ -509,6 +509,22 @@ def test_guides_of_denoising(one_in):
     assert plain.inputs == ("noisy_input",) and plain.stages == ("path_tracing",)
     assert guided.inputs == (*GBUFFER, "noisy_input") and guided.stages == ("gbuffer", "path_tracing")
     assert plain.pixel_fraction == guided.pixel_fraction == 1 / one_in
+
+
+def test_one_sample_trains_towards_independent_noise(method):
+    """A method that reads the 1-spp image compares with the other one; its own noise would teach it to copy."""
+    batch = synthetic_batch()
+    reads = "noisy" in method.inputs
+    assert method.target == ("noisy_input" if reads else "noisy") and method.target in method.training_fields
+    method.eval()
+    prediction, loss = method(batch), method.noisy_loss(method(batch), batch)
+    changed = batch | {method.target: batch[method.target] + 1}
+    if method.target == "noisy":
+        assert torch.equal(method(changed), prediction)
+    assert not torch.equal(method.noisy_loss(prediction, changed), loss)
+    if reads:
+        assert method.stages[-1] == "path_tracing"
+        assert not torch.equal(method(batch | {"noisy": batch["noisy"] + 1}), prediction)
 
 
 def test_denoising_sees_noisy_pixels_alone():
