@@ -88,46 +88,57 @@ def _choose_reference_spp(spec: DatasetSpec, directory: AnyPath, missing: Iterab
         if pilot_name(scene) not in missing:
             continue
         try:
-            mse = Process(_pilot, spec, scene).result()
+            mse, decay = Process(_pilot, spec, scene).result()
         except Died as error:
             raise UserError(f"{description.file}: the renderer crashed on a pilot view ({error})") from None
         pilot = min(PILOT_SPP, spec.reference_spp)
-        spp = needed_spp(spec, mse)
-        choice = {"spp": spp, "predicted_mse": mse * pilot / spp, "pilot_spp": pilot, "pilot_mse": mse}
+        spp = needed_spp(spec, mse, decay)
+        predicted = mse * (pilot / spp) ** decay
+        choice = {"spp": spp, "predicted_mse": predicted, "pilot_spp": pilot, "pilot_mse": mse, "decay": decay}
         write_bytes(directory / pilot_name(scene), json.dumps(choice, indent=1).encode())
         limit = ", the maximum allowed" if choice["predicted_mse"] > spec.reference_mse else ""
         print(f"{description.name}: references of 2 x {spp} spp{limit}; predicted MSE {choice['predicted_mse']:.1e}")
 
 
-def needed_spp(spec: DatasetSpec, mse: float) -> int:
+def needed_spp(spec: DatasetSpec, mse: float, decay: float) -> int:
     """Return the samples per pixel that reach `reference_mse`, given the `mse` between halves on the pilot views.
 
-    The MSE is assumed to be inversely proportional to the samples per pixel, which are rounded up to a power of two and
-    limited to `reference_spp`.
+    The MSE is assumed to fall with the power `decay` of the samples per pixel, which are rounded up to a power of two
+    and limited to `reference_spp`.
     """
     pilot = min(PILOT_SPP, spec.reference_spp)
-    needed = max(pilot, pilot * mse / spec.reference_mse)
+    needed = max(pilot, pilot * (mse / spec.reference_mse) ** (1 / decay))
     return min(spec.reference_spp, 2 ** math.ceil(math.log2(needed)))
 
 
-def _pilot(spec: DatasetSpec, scene: int) -> float:
-    """Return the MSE between two reference halves as displayed, averaged over a scene's pilot views."""
+def _pilot(spec: DatasetSpec, scene: int) -> tuple[float, float]:
+    """Return the MSE between two reference halves as displayed, averaged over a scene's pilot views, and its decay.
+
+    The decay is the power of the samples per pixel with which the MSE falls. It is less than 1, because the display
+    transform clips and compresses the noise of few samples, and tends to 1. So it is taken as the mean of 1 and the
+    power between a quarter of the pilot's samples and all of them.
+    """
     import torch  # here, because processes that render samples do not need it
 
     from nlt.display import display
 
     render = SampleRenderer(spec, scene)
-    spp = min(PILOT_SPP, spec.reference_spp)
+    many = min(PILOT_SPP, spec.reference_spp)
+    few = max(1, many // 4)
     evaluated = [(split, index) for split in ("test", "val") for index in range(spec.count(split))]
-    errors = []
+    errors: dict[int, list[float]] = {few: [], many: []}
     for k, (split, index) in enumerate(evaluated[:PILOT_VIEWS]):
         camera = render.place(split, index)
         # No split has this index, so no sample shares these seeds: the choice must not depend on the references' noise.
         seeds = np.random.SeedSequence([spec.seed, len(SPLITS), scene, k]).generate_state(2)
-        halves = torch.from_numpy(np.stack([render.radiance(camera, spp, int(seed)) for seed in seeds])).double()
-        a, b = display(halves, render.description.exposure)
-        errors.append(float((a - b).square().mean()))
-    return float(np.mean(errors))
+        for spp, of_views in errors.items():
+            halves = torch.from_numpy(np.stack([render.radiance(camera, spp, int(seed)) for seed in seeds])).double()
+            a, b = display(halves, render.description.exposure)
+            of_views.append(float((a - b).square().mean()))
+    noisier, mse = float(np.mean(errors[few])), float(np.mean(errors[many]))
+    if few == many or not mse:
+        return mse, 1.0
+    return mse, (1 + min(1.0, max(0.0, math.log(noisier / mse) / math.log(many / few)))) / 2
 
 
 def _check_space(spec: DatasetSpec, directory: AnyPath, missing: list[str]) -> str:

@@ -21,7 +21,8 @@ from nlt.errors import UserError
 from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 3  # version of the files on disk
+FORMAT = 4  # version of the files on disk
+_MOST_EVALUATED = 8  # samples in a shard of val or test
 _LEAST_SIDE = 8  # of an image, in pixels
 _DRAWS = 1000  # attempts to find a state that no other split has
 
@@ -53,7 +54,7 @@ class DatasetSpec:
         reference_mse: target MSE between the two halves as displayed (sRGB at the scene's exposure). A few pilot views
             of each scene determine the samples per pixel that reach it. With 0, `reference_spp` is used.
         seed: seed of everything random in the dataset.
-        shard_size: samples per file.
+        shard_size: samples per file; at most 8 in val and test, whose references take a thousand times as long.
         integrator: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
 
     Raises:
@@ -156,13 +157,17 @@ class DatasetSpec:
             self.shard(split, scene, start)
             for split in reversed(SPLITS)
             for scene in range(len(self.scenes))
-            for start in range(0, self.count(split), self.shard_size)
+            for start in range(0, self.count(split), self._shard_size(split))
         ]
 
     def shard(self, split: str, scene: int, row: int) -> Shard:
         """Return the shard that contains sample `row` of a scene."""
-        start = row - row % self.shard_size
-        return Shard(split, scene, start, min(start + self.shard_size, self.count(split)))
+        size = self._shard_size(split)
+        start = row - row % size
+        return Shard(split, scene, start, min(start + size, self.count(split)))
+
+    def _shard_size(self, split: str) -> int:
+        return self.shard_size if split == "train" else min(self.shard_size, _MOST_EVALUATED)
 
     def seeds(self, split: str, scene: int, index: int) -> np.random.SeedSequence:
         """Return the seeds of one sample."""

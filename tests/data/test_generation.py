@@ -104,28 +104,32 @@ def as_shown(radiance, exposure):
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
+@pytest.mark.parametrize("decay", [1, 0.7])
 @pytest.mark.parametrize(("most", "target"), [(4096, 1e-3), (4096, 3e-6), (1000, 1e-5), (20, 1e-3), (32, 1e-3)])
-def test_chosen_spp_by_trying_all(most, target):
+def test_chosen_spp_by_trying_all(most, target, decay):
     """The choice is the first power of two, from the pilot's spp on, whose MSE is below the target, or the maximum."""
     spec = spec_of(reference_spp=most, reference_mse=target)
     pilot = min(32, most)
     for mse in [0.0, target, *np.random.default_rng(0).uniform(0, 20, 50) * target]:
-        enough = (2**k for k in range(5, 12) if mse * pilot / 2**k <= target and 2**k < most)
-        assert generation.needed_spp(spec, mse) == next(enough, most)
+        enough = (2**k for k in range(5, 12) if mse * (pilot / 2**k) ** decay <= target and 2**k < most)
+        assert generation.needed_spp(spec, mse, decay) == next(enough, most)
 
 
 def test_pilot_measures_the_halves_disagreement(piloted):
-    """The pilot's MSE agrees with numpy's mean over many pairs of halves of the same views with other seeds."""
+    """The pilot's MSE and its decay agree with numpy's, over many pairs of halves of the same views, by other seeds."""
     spec = spec_of(**PILOTED)
-    render, errors = SampleRenderer(spec, 0), []
+    render, errors = SampleRenderer(spec, 0), {8: [], 32: []}
     for split, index in (("test", 0), ("test", 1), ("test", 2), ("val", 0)):
         camera = render.place(split, index)
-        images = [as_shown(render.radiance(camera, 32, seed), render.description.exposure) for seed in range(20)]
-        errors.append(np.mean([(a - b) ** 2 for a, b in zip(images[::2], images[1::2], strict=True)]))
+        for spp, of_views in errors.items():
+            images = [as_shown(render.radiance(camera, spp, seed), render.description.exposure) for seed in range(20)]
+            of_views.append(np.mean([(a - b) ** 2 for a, b in zip(images[::2], images[1::2], strict=True)]))
     found = json.loads((piloted / store.pilot_name(0)).read_text())
-    assert found["pilot_spp"] == 32 and found["pilot_mse"] == pytest.approx(np.mean(errors), rel=0.3)
-    assert found["spp"] == generation.needed_spp(spec, found["pilot_mse"])
-    assert found["predicted_mse"] == pytest.approx(found["pilot_mse"] * 32 / found["spp"])
+    assert found["pilot_spp"] == 32 and found["pilot_mse"] == pytest.approx(np.mean(errors[32]), rel=0.3)
+    power = np.log(np.mean(errors[8]) / np.mean(errors[32])) / np.log(4)
+    assert 0.5 < found["decay"] < 1 and found["decay"] == pytest.approx((1 + power) / 2, abs=0.1)
+    assert found["spp"] == generation.needed_spp(spec, found["pilot_mse"], found["decay"])
+    assert found["predicted_mse"] == pytest.approx(found["pilot_mse"] * (32 / found["spp"]) ** found["decay"])
 
 
 def test_references_have_the_chosen_spp(piloted):
@@ -187,7 +191,7 @@ def test_no_pilots_without_references():
 
 # ---- interruption ---------------------------------------------------------------------------------------
 
-LONG = {**SIZE, "resolution": 8, "train": 768, "val": 128, "test": 128, "num_points": 16, "num_photons": 16,
+LONG = {**SIZE, "resolution": 8, "train": 768, "val": 16, "test": 16, "num_points": 16, "num_photons": 16,
         "input_spp": 1, "reference_spp": 1, "shard_size": 64}  # fmt: skip
 # The trial of the renderer before the first job would be half of the time.
 RUN = f"""if __name__ == "__main__":
