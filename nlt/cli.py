@@ -157,6 +157,7 @@ def _render(options: argparse.Namespace) -> None:
         spp=options.spp,
         photons=options.photons,
         layers=options.exr,
+        steady=options.steady,
     )
 
 
@@ -303,6 +304,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         "--spp", type=_spp, help="samples per pixel of path tracing; 0 omits it (default: equal, at equal time)"
     )
     parser.add_argument("--photons", type=positive, help="number of input photons (default: as in training)")
+    parser.add_argument("--steady", action="store_true", help="blend each frame with those before it: less flicker")
     parser.add_argument("--exr", action="store_true", help="also write each frame as a multi-layer EXR into the folder")
 
 

@@ -34,6 +34,7 @@ from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, accelerate, default_device
+from nlt.models.steady import Steady
 from nlt.paths import find_config
 from nlt.rendering.exr import exr
 from nlt.scenes.camera import Camera
@@ -56,8 +57,10 @@ class ModelRenderer:
 
     `scene` is the scene's index in `spec`. Photons have the same seed in all states, so that they follow a moving
     light without flicker. Several methods may share the `render` of one scene. `seconds` holds the seconds of each
-    stage since it was last cleared.
+    stage since it was last cleared. `steady`, if set, blends each frame with those before it.
     """
+
+    steady: Steady | None = None
 
     def __init__(
         self,
@@ -72,7 +75,7 @@ class ModelRenderer:
         self.method = method.to(device).eval()
         self.seconds: dict[str, float] = {}
         self.moving = MovingCamera(self.method, self.stage)
-        self._seeds = np.random.SeedSequence([_MODEL])
+        self._seeds = np.random.SeedSequence([_MODEL])  # of all that has the same seed in every frame
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
         self._state_fields = {name for name in method.fields if name.startswith("photon_")}
@@ -87,9 +90,10 @@ class ModelRenderer:
         stored = self.spec.directory(_DATASETS) / points_name(self.scene)
         return read_points(stored) if stored.exists() else self.render.points()
 
-    def batch(self, state: SceneState, camera: Camera) -> Batch:
-        """Return the fields of a frame that the method reads, as a batch of one."""
-        names = {*self.method.fields}
+    def batch(self, state: SceneState, camera: Camera, number: int = 0) -> Batch:
+        """Return the fields of a frame that the method reads, as a batch of one; noise differs by its number."""
+        seeds = np.random.SeedSequence([_MODEL, number])
+        names = {*self.method.fields, *(Steady.fields if self.steady else ())}
         sparse = 0 < self.method.pixel_fraction < 1
         traced = set() if sparse else names & {*TRACED}
         self._set_state(state)
@@ -101,17 +105,17 @@ class ModelRenderer:
             view = self.render.view(camera, self._seeds, {*(names & {*BUFFERS}), "camera_matrix", "world_to_view"})
         if traced:
             with self.stage("path_tracing"):
-                view |= self.render.view(camera, self._seeds, traced)
-        tensors = self._tensors(self.scene, self._state | view)
+                view |= self.render.view(camera, seeds, traced)
+        tensors = self._tensors(self.scene, self._state | view, number)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
         batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
-        return batch | {"noisy_input": self._trace_input_pixels(batch, camera)} if sparse else batch
+        return batch | {"noisy_input": self._trace_input_pixels(batch, camera, seeds)} if sparse else batch
 
-    def _trace_input_pixels(self, batch: Batch, camera: Camera) -> Tensor:
+    def _trace_input_pixels(self, batch: Batch, camera: Camera, seeds: np.random.SeedSequence) -> Tensor:
         """Return radiance (1, 3, H, W) traced only at the method's input pixels; 0 elsewhere."""
         mask = self.method.mask(batch, camera.height, camera.width)[0, 0].cpu().numpy()
         image = np.zeros((3, *mask.shape), np.float32)
-        seed = int(self._seeds.generate_state(1)[0])
+        seed = int(seeds.generate_state(1)[0])
         with self.stage("path_tracing"):
             image[:, mask] = self.render.radiance(camera, self.spec.input_spp, seed, np.flatnonzero(mask))
         return torch.from_numpy(image)[None].to(self.device)
@@ -120,9 +124,11 @@ class ModelRenderer:
         if state.key != self.render.scene.state.key:
             self.render.scene.set_state(state)
 
-    def frame(self, state: SceneState, camera: Camera) -> Tensor:
+    def frame(self, state: SceneState, camera: Camera, number: int = 0) -> Tensor:
         """Return the method's radiance (1, 3, H, W)."""
-        return self.moving(self.method.subsample(self.batch(state, camera)))
+        batch = self.batch(state, camera, number)
+        image = self.moving(self.method.subsample(batch))
+        return self.steady(image, batch) if self.steady else image
 
     def traced(self, state: SceneState, camera: Camera, spp: int, frame: int) -> Tensor:
         """Return path-traced radiance (1, 3, H, W)."""
@@ -182,6 +188,7 @@ def render(
     spp: int | None = None,
     photons: int | None = None,
     layers: bool = False,
+    steady: bool = False,
 ) -> Path:
     """Write a video of a scene: the method left, path tracing right, captions with the measured time per frame.
 
@@ -196,6 +203,7 @@ def render(
         resolution: width and height of each of the two images.
         spp: samples per pixel of path tracing; None for as many as the method's time allows, 0 for no path tracing.
         photons: number of photons to cast (default: as in the dataset).
+        steady: blend each of the method's frames with those before it (nlt/models/steady.py).
         layers: also write a multi-layer EXR (nlt/rendering/exr.py) of each frame; the output must be a folder.
 
     Raises:
@@ -216,7 +224,7 @@ def render(
     key = _digest(
         Path(checkpoint).read_bytes(),
         description.digest.encode(),
-        json.dumps([dataclasses.asdict(spec), resolution, spp], sort_keys=True).encode(),
+        json.dumps([dataclasses.asdict(spec), resolution, spp, steady], sort_keys=True).encode(),
         *(part for v in views for part in (v.matrix.tobytes(), v.world_to_view.tobytes())),
         *(moment.key for moment in scene_states),
     )
@@ -226,6 +234,7 @@ def render(
     missing = [k for k, name in enumerate(names) if not is_done(name)]
     if missing:
         model = open_model(checkpoint, (method, spec, checksums), index)
+        model.steady = Steady() if steady else None
         policy = Policy.for_device(model.device)
         with torch.no_grad():
             if not manifest:
@@ -238,7 +247,13 @@ def render(
                     **times,
                 }
                 manifest |= {"scene": scene, "experiment": spec.experiment, "frames": frames, "resolution": resolution}
+                manifest["steady"] = steady
                 write_bytes(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+            if steady:  # the frames before a missing one are blended into it
+                model.steady = Steady()
+                for k in range(missing[0]):
+                    model.frame(scene_states[k], views[k], k)
+                missing = list(range(missing[0], frames))
             done = frames - len(missing)
             for k in tqdm(missing, "rendering", frames, unit="frame", file=sys.stderr, initial=done):
                 frame = _panels(model, scene_states[k], views[k], k, manifest)
@@ -337,7 +352,7 @@ def _panels(
     model: ModelRenderer, state: SceneState, view: Camera, k: int, manifest: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """Return a frame's radiance (3, H, W) by the method and, unless its spp are 0, by path tracing."""
-    panels = {"radiance": model.frame(state, view)}
+    panels = {"radiance": model.frame(state, view, k)}
     if manifest["spp"]:
         panels["path_tracing"] = model.traced(state, view, manifest["spp"], k)
     return {name: image[0].cpu().numpy() for name, image in panels.items()}
@@ -345,7 +360,7 @@ def _panels(
 
 def _frame_png(images: dict[str, np.ndarray], exposure: float, manifest: dict[str, Any]) -> bytes:
     """Return a frame as a PNG of even size: the images (3, H, W) next to each other, with captions below."""
-    captions = [f"{manifest['method']}, {_ms(manifest['model_ms'])}"]
+    captions = [f"{manifest['method']}{', steady' * manifest['steady']}, {_ms(manifest['model_ms'])}"]
     if manifest["spp"]:
         captions.append(f"path tracing, {manifest['spp']} spp, {_ms(manifest['path_tracing_ms'])}")
     _, rows, columns = images["radiance"].shape

@@ -21,7 +21,7 @@ from nlt.evaluation.results import MANIFEST, OK, Results, read_rows, write_rows
 from nlt.report import plots
 from nlt.report.page import Section
 from nlt.report.table_writer import Table, section
-from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED, ROWS, STRESS, TRAININGS
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, PATHS, RENDERED, ROWS, STEADY, STRESS, TRAININGS
 
 BREAKING, TEXT = "breaking.csv", "stress.md"
 DOUBLED = 2.0  # growth over the clean error at which a method breaks
@@ -198,7 +198,7 @@ def _about(stressed: Stressed, method: str) -> str:
 def _tables(stressed: Stressed) -> list[Table]:
     """Return the tables of breaking points, ranks, flicker and trainings, without empty ones."""
     methods = stressed.methods
-    points, ranks, flicker = [], [], []
+    points, ranks, flicker, steady = [], [], [], []
     for ladder, errors in stressed.errors.items():
         growth = {method: f"({own[-1] / own[0]:.2g})" for method, own in errors.items()}
         cells = [f"{stressed.break_text(ladder, m)} {growth[m]}" if m in errors else _NONE for m in methods]
@@ -211,16 +211,26 @@ def _tables(stressed: Stressed) -> list[Table]:
         value = lambda kind, method=method: stressed.mean(method, (FLICKER, kind), 0, "value")
         draws = [_number(100 * value(kind), ".2f") for kind in _FLICKERS]
         flicker.append([label(method), *draws, *(_number(value(kind)) for kind in PATHS)])
+        if any(row["ladder"].endswith(STEADY) for row in stressed.rows if row["suite"] == FLICKER):
+            error = lambda kind, method=method: stressed.mean(method, (FLICKER, kind), 0)
+            ratios = ((of(kind + STEADY) / of(kind) for of in (value, error)) for kind in PATHS)
+            steady.append([label(method), *(_number(ratio) for pair in ratios for ratio in pair)])
     note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
     flicker_note = (
         "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
         "square change from frame to frame on a smooth path, over the reference's."
     )
     rank_columns = ["best, clean", "best at the highest severity", "Kendall's τ of the two orders"]
+    steady_note = (
+        "Blended frames (`nlt render --steady`) over frames as they are, on the same paths: change from frame to "
+        "frame, and error. Below 1 is better; where the error is above 1, the blended frames lag behind."
+    )
+    steady_columns = [f"{what}, {kind}" for kind in PATHS for what in ("change", "error")]
     all_tables = [
         Table("Breaking points", note, [label(method) for method in methods], points, first="ladder"),
         Table("Ranks", "", rank_columns, ranks, first="ladder"),
         Table("Flicker", flicker_note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], flicker),
+        Table("Steady frames", steady_note, steady_columns, steady),
         _trainings(stressed),
     ]
     return [table for table in all_tables if table.rows]

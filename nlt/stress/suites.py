@@ -17,6 +17,7 @@ RENDERED = ("light", "geometry", "materials", "camera")  # suites whose views ar
 COMPUTED = ("budget", "frame")  # suites that change a rendered view's inputs
 STRESS, ROWS, TRAININGS = "stress", "stress.csv", "training.csv"  # the directory of the results, and its files
 PATHS = ("camera", "light", "object")  # of the suite flicker, by the thing that moves
+STEADY = "_steady"  # after a path's name: its frames blended by nlt.models.steady
 SUITES = (*RENDERED, *COMPUTED, FLICKER, TRAINING)
 Number = float | int  # 2 and 2.0 stay as they are written, because the hash of a manifest names what was rendered
 

@@ -21,10 +21,11 @@ from nlt.errors import UserError
 from nlt.evaluation.evaluate import evaluate
 from nlt.metrics.image_metrics import ImageMetrics
 from nlt.models.method import Batch, Method
+from nlt.models.steady import Steady
 from nlt.models.transport import PointEmbedding
 from nlt.stress.inputs import INPUTS
 from nlt.stress.rendering import DRAWS, ViewSet
-from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, Suites
+from nlt.stress.suites import CLEAN, COMPUTED, FLICKER, STEADY, Suites
 
 
 @dataclass
@@ -131,7 +132,8 @@ class SuiteViews:
         """Return a method's rows of the suite flicker.
 
         The `value` of draws is the standard deviation of a pixel over the draws, relative to the image. The `value` of
-        a path is the mean square change from frame to frame, relative to the reference's.
+        a path is the mean square change from frame to frame, relative to the reference's. Paths have two rows, one for
+        the frames as they are and one for the blended ones, and their `error` is that of all frames.
         """
         rows = []
         for clean_set in (view_set for view_set in self.view_sets if view_set.suite == CLEAN):
@@ -158,12 +160,22 @@ class SuiteViews:
                 rows.append(row(kind, (images.var(0).mean().item() / scale) ** 0.5, images))
             for view_set in (view_set for view_set in mine if view_set.is_path):
                 frames = self.batch(view_set)
-                own, a, b = (
-                    expose(x.double(), frames["exposure"]).diff(dim=0)
-                    for x in (self.predict(method, frames), frames["reference_a"], frames["reference_b"])
-                )
-                rows.append(row(view_set.ladder, (own.square().mean() / (a * b).mean()).item(), own))
+                references, exposure = (frames["reference_a"], frames["reference_b"]), frames["exposure"]
+                a, b = (expose(x.double(), exposure).diff(dim=0) for x in references)
+                alone = self.predict(method, frames)
+                for name, images in (("", alone), (STEADY, _blended(alone, frames))):
+                    own = expose(images.double(), exposure).diff(dim=0)
+                    change = (own.square().mean() / (a * b).mean()).item()
+                    error = relative_error(images, *references, exposure).mean().item()
+                    rows.append(row(view_set.ladder + name, change, own) | {"error": error})
         return rows
+
+
+def _blended(radiance: Tensor, frames: Batch) -> Tensor:
+    """Return the radiance (V, 3, H, W) of consecutive frames, each blended with those before it."""
+    steady = Steady()
+    each = [{name: frames[name][k : k + 1] for name in Steady.fields} for k in range(len(radiance))]
+    return torch.cat([steady(radiance[k : k + 1], frame) for k, frame in enumerate(each)])
 
 
 def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Method:

@@ -26,6 +26,7 @@ from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.render import DEMO, ModelRenderer, render, shown, with_scene, write_video
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy, accelerate
+from nlt.models.steady import Steady
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.state import sample_state
 from nlt.scenes.trajectory import cameras, follow, states, turn, write_camera, write_state
@@ -109,6 +110,37 @@ def test_traces_only_the_pixels_that_the_method_looks_at():
     noise = model.render.radiance(view, 64, 1) - whole.numpy()  # of as many samples, at all pixels
     assert (given - whole)[:, looked].square().mean() < 20 * np.square(noise).mean()
     assert given[:, looked].mean() == pytest.approx(whole[:, looked].mean().item(), rel=0.3)
+
+
+def test_steady_frames_are_blended_ones(models, tmp_path):
+    """Steady frames are those of the method, blended in order; a lost frame is made again as it was."""
+    ask = lambda: render(str(models.nlt), "living_room", "steady", "3", frames=3, resolution=SIZE, spp=0, steady=True)
+    ask()
+    method, spec, _ = load_trained(str(models.nlt))
+    model = ModelRenderer(accelerate(method, Policy.for_device(CPU), CPU), spec, 0, CPU)
+    description, steady = model.render.description, Steady()
+    (moment,) = states(description, "moving_lights", "3", None, 1)
+    files = [tmp_path / "steady" / f"{k:05d}.png" for k in range(3)]
+    with torch.no_grad():
+        for k, view in enumerate(cameras(description, "turntable", 3, *SIZE)):
+            alone = model.frame(moment, view, k)
+            depth = torch.from_numpy(model.gbuffer(moment, view)["depth"])[None]
+            blended = steady(alone, model.batch(moment, view) | {"depth": depth})
+            expected = 255 * display(blended, description.exposure)[0].permute(1, 2, 0)
+            assert (pixels(files[k])[: SIZE[1]] == expected.round().numpy()).all()
+            assert (k == 0) == torch.equal(blended, alone)
+    content = files[2].read_bytes()
+    files[2].unlink()
+    ask()
+    assert files[2].read_bytes() == content
+
+
+def test_noise_differs_from_frame_to_frame():
+    model = ModelRenderer(GuidedOneSample(width=2, depth=1), spec_of(), 0, CPU)
+    description = model.render.description
+    (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
+    first, again, other = (model.batch(moment, view, number)["noisy"] for number in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, other)
 
 
 def test_traces_one_sample_for_the_method_that_reads_it():

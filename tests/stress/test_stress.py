@@ -31,7 +31,7 @@ from nlt.stress.inputs import INPUTS
 from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
 from nlt.stress.report import breaking_point, stress_section
-from nlt.stress.suites import load_suites
+from nlt.stress.suites import FLICKER, PATHS, ROWS, STEADY, load_suites
 
 pytestmark = pytest.mark.slow
 
@@ -340,6 +340,19 @@ def stressed(tiny, tmp_path_factory):
         yield SimpleNamespace(command=command, directory=out / "stress", folder=folder, methods=methods)
     finally:
         os.chdir(here)
+
+
+def test_blended_frames_of_a_path(stressed):
+    """Blending takes noise away: path traced frames change less, and err less under a camera that stands still."""
+    rows = read_rows(stressed.directory / ROWS)
+    of = lambda ladder: [
+        r for r in rows if (r["method"], r["suite"], r["ladder"]) == ("path_tracing_1", FLICKER, ladder)
+    ]
+    for path in PATHS:
+        (alone,), (steady,) = of(path), of(path + STEADY)
+        assert 0 < steady["value"] < alone["value"], path
+        assert path == "camera" or 0 < steady["error"] < alone["error"], path
+    assert "Steady frames" in (stressed.directory / "stress.md").read_text()
 
 
 def test_an_unknown_change(stressed, tmp_path, capsys):
