@@ -107,15 +107,15 @@ def _run(arguments: list[str]) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from nlt.data.generate import generate
     from nlt.evaluation.compare import compare
     from nlt.evaluation.comparison import Comparison
     from nlt.evaluation.results import load
+    from nlt.evaluation.trainings import generate_datasets
     from nlt.report.tables import write_tables
 
     overrides = (options.scale, options.data, options.methods, options.seeds, options.precision, options.train_images)
     comparison, machines = Comparison.load(options.config, *overrides), (options.workers, options.scheduler)
-    dataset = generate(comparison.spec, comparison.root, *machines, dict(options.slurm))
+    dataset = generate_datasets(comparison, *machines, dict(options.slurm))
     after_row = lambda folder: write_tables(load(folder))
     directory = compare(comparison, dataset, options.out, *machines, dict(options.slurm), after_row)
     _draw(directory)

@@ -64,9 +64,8 @@ def compare(
     """
     start, provenance = time.time(), origin()
     directory, spec = Path(out or Path("results") / comparison.name), comparison.spec
-    root = Path("runs") / dataset.name
     trainings = {
-        (method, seed, count): Training.of(comparison, method, seed, root, count)
+        (method, seed, count): Training.of(comparison, method, seed, comparison.runs(method), count)
         for count in (None, *sorted({*comparison.train_images} - {spec.train}))
         for method, seed in comparison.rows
         if method in comparison.trained
@@ -87,7 +86,8 @@ def compare(
         run: dict[str, Any] = {"method": method, "seed": seed}
         with _record_failure(run):
             if method in comparison.untrained:
-                module, facts, folder = comparison.untrained[method], dict[str, Any](), root / method
+                module, facts = comparison.untrained[method], dict[str, Any]()
+                folder = Path("runs") / dataset.name / method
             else:
                 training = trainings[method, seed, None]
                 (module, facts), folder = _load_trained(training, failures, device), training.run

@@ -49,7 +49,8 @@ class Comparison:
         name: the config's name, with the scale and the data if they differ from the config's.
         spec, root: the dataset and the directory of datasets.
         files: the config files of each method, later ones overriding earlier ones. `variant` changes every trained
-            method; METHOD@VARIANT applies a further config of configs/variant to a single method.
+            method; METHOD@VARIANT applies a further config of configs/variant to a single method. A variant may also
+            name another dataset to train on, which shows how a method does in rooms that it has never seen.
         train_images: every method is also trained on only the first N images of each scene, for each N.
     """
 
@@ -110,6 +111,12 @@ class Comparison:
         )  # fmt: skip
         for method in found.trained:
             check_configs([str(path) for path in files[method]])
+            elsewhere = found.training_specs[method] != spec
+            if elsewhere and build(found.configs[method], files[method][1]).has_point_embeddings:
+                raise UserError(
+                    f"{files[method][-1]}: data.dataset: {method} has embeddings of the points of its training scenes; "
+                    "name only methods without them, such as photons_only"
+                )
         return found
 
     @property
@@ -132,6 +139,15 @@ class Comparison:
     def trained(self) -> list[str]:
         """The names of the methods that need training."""
         return [method for method in self.methods if method not in self.untrained]
+
+    @cached_property
+    def training_specs(self) -> dict[str, DatasetSpec]:
+        """The dataset that each trained method is trained on."""
+        return {method: load_spec([str(path) for path in self.files[method]])[0] for method in self.trained}
+
+    def runs(self, method: str) -> Path:
+        """Return the directory of a method's trainings."""
+        return Path("runs") / self.training_specs[method].directory(self.root).name
 
     @property
     def rows(self) -> list[tuple[str, int]]:

@@ -19,7 +19,8 @@ import yaml
 
 from nlt.config import merge
 from nlt.data import engines
-from nlt.data.files import write_bytes
+from nlt.data.files import AnyPath, write_bytes
+from nlt.data.generate import generate
 from nlt.errors import DivergedError, UserError, to_user_error
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
@@ -93,6 +94,15 @@ class Training:
         assert checkpoint is not None
         module = RenderingModule.load_from_checkpoint(checkpoint, map_location=device).eval()
         return module, outcome | {"run": os.path.relpath(self.run)}
+
+
+def generate_datasets(
+    comparison: Comparison, workers: int | None = None, scheduler: str = "local", slurm: Mapping[str, str] | None = None
+) -> AnyPath:
+    """Render what is missing of the compared dataset and of those that its methods train on; return the former."""
+    specs = [comparison.spec, *comparison.training_specs.values()]
+    directories = [generate(spec, comparison.root, workers, scheduler, slurm) for spec in specs]
+    return directories[0]
 
 
 def train(

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nlt.data.generate import generate
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.provenance import origin, surroundings
 from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
-from nlt.evaluation.trainings import Training, train
+from nlt.evaluation.trainings import Training, generate_datasets, train
 from nlt.models.method import Method
 from nlt.models.policy import Policy, accelerate, default_device
 from nlt.report.claims import write_claims
@@ -74,9 +73,11 @@ def stress(
         for scene, description in enumerate(spec.descriptions)
         if (need := lacks(spec, scene, ladder.change))
     ]
-    dataset = generate(spec, comparison.root)
+    dataset = generate_datasets(comparison)
     runs = Path("runs") / dataset.name
-    trainings = {name: Training.of(comparison, name, comparison.seeds[0], runs) for name in comparison.trained}
+    trainings = {
+        name: Training.of(comparison, name, comparison.seeds[0], comparison.runs(name)) for name in comparison.trained
+    }
     failures = train(list(trainings.values()), "local", None, {})
     sets, rendered = view_sets(spec, content, wanted), content.directory(spec, comparison.root)
     render_suites(spec, dataset, content, sets, rendered)

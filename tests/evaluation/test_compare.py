@@ -8,6 +8,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -475,6 +476,35 @@ def test_trainings_never_have_more_threads_than_cores(tmp_path, monkeypatch, cor
     with pytest.raises(KeyboardInterrupt):
         train(jobs, "local", workers, {})
     assert started == threads
+
+
+@pytest.fixture
+def elsewhere(world):
+    """A variant that trains in another room, which is larger and has other objects."""
+    dataset = {"scenes": ["bedroom"], "train": 4, "val": 1, "test": 0}
+    file = write(world.folder / "configs/variant/elsewhere.yaml", {"data": {"dataset": dataset}})
+    yield file
+    file.unlink()
+
+
+def test_a_method_trained_in_another_room(world, elsewhere):
+    """It is judged in the compared room; the other room's dataset is rendered for its training."""
+    rows = world.compare("--methods", "cnn", "cnn@elsewhere", out="unseen")
+    here, there = (world.runs("unseen")[name]["run"] for name in ("cnn", "cnn@elsewhere"))
+    assert Path(here).parent.name == world.tiny.dataset.name and Path(there).parent.name.startswith("moving_lights-bed")
+    (dataset,) = Path(world.tiny.dataset).parent.glob("moving_lights-bedroom-*")
+    manifest = json.loads((dataset / "manifest.json").read_text())
+    assert (manifest["spec"]["scenes"], manifest["spec"]["test"]) == (["bedroom"], 0)
+    assert len(list((dataset / "train").iterdir())) == 1
+    assert rows["cnn@elsewhere"]["mse"] != rows["cnn"]["mse"]
+
+
+def test_no_embeddings_of_another_room(world, elsewhere, capfd, trainings):
+    arguments = ["compare", "--config", str(world.config), "--methods", "cnn", "nlt@elsewhere", "--out=refused"]
+    assert main(arguments) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "elsewhere.yaml: data.dataset" in error and "photons_only" in error
+    assert trainings == []
 
 
 @pytest.mark.parametrize("section", ["model", "trainer", "data"])
