@@ -52,7 +52,9 @@ FIELDS: dict[str, Field] = {
     "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second half, independent of the first", True),
     "depth": Field((1, "H", "W"), "float32", "m", "camera-space depth z at the pixel centre; 0 if no surface is hit"),
     "normal": Field((3, "H", "W"), "float16", "1", "shading normal in world space; 0 if no surface is hit"),
-    "albedo": Field((3, "H", "W"), "float16", "1", "diffuse reflectance in [0, 1]; 0 for mirrors and glass"),
+    "albedo": Field(
+        (3, "H", "W"), "float16", "1", "pixel mean of the diffuse reflectance, in [0, 1]; mirrors and glass have 0"
+    ),
     "emission": Field(
         (3, "H", "W"), "float32", _RADIANCE, "pixel mean of the radiance seen directly from lamps and the environment"
     ),

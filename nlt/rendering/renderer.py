@@ -4,6 +4,7 @@ All results are numpy arrays in metres, world coordinates and linear, unclamped 
 """
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -25,7 +26,8 @@ _MAX_LANES = 1 << 20
 _PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
 _MOST_CASTS = 1024  # per requested photon
 _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
-_SIDE = 4  # Emission is the mean over 4 x 4 rays in each pixel.
+_ALBEDO_SIDE, _EMISSION_SIDE = 2, 4  # They are means over so many rays squared in each pixel.
+_UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
 class Renderer:
@@ -48,7 +50,8 @@ class Renderer:
         self.emitters = list(scene.mi_scene.emitters())
         self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
         self._radiance = freeze(_radiance if is_path else _bidirectional)
-        self._gbuffer, self._emission, self._transmits = freeze(_gbuffer), freeze(_emission), freeze(_transmits)
+        self._gbuffer, self._transmits = freeze(_gbuffer), freeze(_transmits)
+        self._albedo, self._emission = freeze(_albedo), freeze(_emission)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
         room = scene.description.room
@@ -130,8 +133,8 @@ class Renderer:
         """Trace primary rays, which pass through the transparent parts of opacity masks.
 
         Returns:
-            depth (1, H, W), shading normal (3, H, W) and albedo (3, H, W) at pixel centres; emission (3, H, W), the
-            radiance that a pixel sees directly from lamps and from the environment, as the mean over its area.
+            depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
+            radiance seen directly from lamps and from the environment, as means over each pixel's area.
         """
         fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
         centres = camera.centres().astype(np.float32)
@@ -139,14 +142,16 @@ class Renderer:
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
-        emission = np.zeros((len(centres), 3), np.float32)
-        pixels = np.flatnonzero(self._may_see_light(camera, ~valid))
-        if len(pixels):
-            lanes = {"corner": ("Point2f", np.floor(centres[pixels]))}
-            (emission[pixels],) = launch(self._emission, lanes, **fixed)
         mask = valid[:, None]
+        albedo, emission = np.where(mask, albedo, 0), np.zeros((len(centres), 3), np.float32)
+        for kernel, values, pixels in (
+            (self._albedo, albedo, _varies(albedo, camera)),
+            (self._emission, emission, self._may_see_light(camera, ~valid)),
+        ):
+            if pixels.any():
+                (values[pixels],) = launch(kernel, {"corner": ("Point2f", np.floor(centres[pixels]))}, **fixed)
         buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(mask, normal, 0)}
-        buffers |= {"albedo": np.where(mask, albedo, 0), "emission": emission}
+        buffers |= {"albedo": albedo, "emission": emission}
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
     def _may_see_light(self, camera: Camera, escapes: np.ndarray) -> np.ndarray:
@@ -247,6 +252,22 @@ class Renderer:
         return launch(self._photons[emitter], lanes, emitter=self.emitters[emitter], **fixed)
 
 
+def _varies(albedo: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return (H W,) bool: the pixels at an edge or in a texture, by the albedo (H W, 3) at pixel centres.
+
+    The others, half of an image at 64x64 and more at higher resolutions, need no further rays. The image's border
+    counts as an edge, because the neighbours outside are not known.
+    """
+    image = albedo.reshape(camera.height, camera.width, 3)
+    varies = np.ones(image.shape[:2], bool)
+    varies[1:-1, 1:-1] = False
+    for lines, marks in ((image, varies), (image.swapaxes(0, 1), varies.T)):
+        differs = (np.abs(lines[1:] - lines[:-1]) > _UNIFORM).any(-1)
+        marks[1:] |= differs
+        marks[:-1] |= differs
+    return varies.ravel()
+
+
 def sensor_to_world(camera: Camera, units_per_metre: float) -> Any:
     """Return the transform of Mitsuba's camera, which looks along +z like ours, but whose x points left and y up."""
     view_to_world = np.linalg.inv(camera.world_to_view.astype(float))
@@ -281,16 +302,32 @@ def _gbuffer(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
     return interaction.p, interaction.sh_frame.n, albedo, valid
 
 
-def _emission(scene: Any, masks: bool, corner: Any, **camera: Any) -> tuple:
+def _pixel_mean(value: Callable, side: int, scene: Any, masks: bool, corner: Any, **camera: Any) -> tuple:
+    """Return the mean of the colour `value(interaction)` over side x side rays in each pixel."""
+
     def step(k: Any, total: Any) -> tuple:
-        place = (mi.Point2f(mi.Float(k % _SIDE), mi.Float(k // _SIDE)) + 0.5) / _SIDE
-        interaction = first_surface(scene, _ray(corner + place, **camera), masks)
-        emitter = interaction.emitter(scene)  # the environment if the ray escapes
-        return k + 1, total if emitter is None else total + mi.Color3f(emitter.eval(interaction))
+        place = (mi.Point2f(mi.Float(k % side), mi.Float(k // side)) + 0.5) / side
+        return k + 1, total + value(first_surface(scene, _ray(corner + place, **camera), masks))
 
     # An unrolled loop takes a minute to compile in a large scene and runs no faster.
-    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: k < _SIDE**2, step)
-    return (total / _SIDE**2,)
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: k < side**2, step)
+    return (total / side**2,)
+
+
+def _albedo(scene: Any, **fixed: Any) -> tuple:
+    def albedo(interaction: Any) -> Any:
+        valid = interaction.is_valid()
+        return diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
+
+    return _pixel_mean(albedo, _ALBEDO_SIDE, scene, **fixed)
+
+
+def _emission(scene: Any, **fixed: Any) -> tuple:
+    def emission(interaction: Any) -> Any:
+        emitter = interaction.emitter(scene)  # the environment if the ray escapes
+        return mi.Color3f(0) if emitter is None else mi.Color3f(emitter.eval(interaction))
+
+    return _pixel_mean(emission, _EMISSION_SIDE, scene, **fixed)
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:

