@@ -108,10 +108,10 @@ def curves(results: Results) -> dict[str, list[str]]:
             families.setdefault((run["family"], label(name).rpartition(" (")[0]), []).append(method)
     time = partial(results.mean, key="time_per_frame_s")
     joined = {f"{name}, variants": sorted(members, key=time) for name, members in variants.items() if len(members) > 1}
+    rays = lambda m: runs[m]["spp"] * runs[m]["pixel_fraction"]
     for members in families.values():
-        if len(members) > 1:
+        if len({rays(m) for m in members}) > 1:
             varied = "spp" if len({runs[m]["spp"] for m in members}) > 1 else "pixels traced"
-            rays = lambda m: runs[m]["spp"] * runs[m]["pixel_fraction"]
             joined[f"{label(members[0]).partition(' (')[0]} ({varied})"] = sorted(members, key=rays)
     return joined
 
