@@ -610,7 +610,9 @@ def test_crops_are_windows_of_the_images(dataset, crops):
         corners.add((column, row))
         inside = np.s_[:, row : row + 8, column : column + 8]
         for name in ("depth", "normal", "albedo"):
-            np.testing.assert_allclose(cut[name], full[name][inside], rtol=1e-3, atol=1e-3)
+            border = int(name == "albedo")  # a window does not know whether the albedo differs beyond its border
+            seen = np.s_[:, border : 8 - border, border : 8 - border]
+            np.testing.assert_allclose(cut[name][seen], full[name][inside][seen], rtol=1e-3, atol=1e-3)
         for name in ("photon_hit", "photon_flux", "translation", "world_to_view"):
             assert np.array_equal(cut[name], full[name])
         assert cut["noisy"].shape == cut["noisy_input"].shape == (3, 8, 8)

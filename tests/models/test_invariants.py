@@ -128,7 +128,8 @@ def mirrored(batch):
 
 def reads_positions(method):
     """It is fed with absolute positions or directions, so a prediction depends on the world's frame."""
-    return isinstance(method, NeuralLightTransport) or method.hparams.get("position", False)
+    transports = isinstance(method, NeuralLightTransport) and "camera_matrix" in method.inputs
+    return transports or method.hparams.get("position", False)
 
 
 ROTATION, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)).double())

@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import LIGHT, write_room
+from scipy import ndimage
 
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.assembly import Scene
@@ -70,7 +71,8 @@ def test_gbuffer(tmp_path, masked, layers):
     assert lamp.sum() > 20 and ceiling.sum() > 20
     assert np.allclose(buffer["depth"][0, lamp], LIGHT["height"] - 0.8, atol=1e-3)
     assert np.allclose(buffer["depth"][0, ceiling], 2 - 0.8, atol=1e-3)
-    assert np.allclose(buffer["albedo"][:, ceiling].T, [0.7, 0.6, 0.5], atol=1e-5)
+    inside = ndimage.binary_erosion(ceiling, np.ones((3, 3)))  # at its edges, the albedo is that of two surfaces
+    assert np.allclose(buffer["albedo"][:, inside].T, [0.7, 0.6, 0.5], atol=1e-5) and inside.sum() > 10
     assert np.allclose(buffer["normal"][:, ceiling].T, [0, -1, 0], atol=1e-5)
 
 

@@ -368,7 +368,7 @@ def test_rows(stressed):
     rows = read_rows(stressed.directory / "stress.csv")
     ladders = {method: {row["ladder"] for row in rows if row["method"] == method} for method in stressed.methods}
     shared = {"views", "brighter", "thinner", "aspect", "shifted", "turned", "mirrored"}
-    shared |= {"camera", "light", "object"}
+    shared |= {path + ending for path in PATHS for ending in ("", STEADY)}
     assert ladders["path_tracing_1"] == shared
     assert ladders["denoising_1_4"] == shared | {"pixels", "spp", "noise"}
     assert ladders["nlt_photons"] == shared | {"points", "photons"}
