@@ -3,6 +3,7 @@
 All results are numpy arrays in metres, world coordinates and linear, unclamped RGB.
 """
 
+import itertools
 import logging
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +11,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 from nlt.errors import UserError
 from nlt.scenes.assembly import Scene
@@ -51,7 +51,6 @@ class Renderer:
         self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
         self._radiance = freeze(_radiance if is_path else _bidirectional)
         self._gbuffer, self._transmits = freeze(_gbuffer), freeze(_transmits)
-        self._albedo, self._emission = freeze(_albedo), freeze(_emission)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
         room = scene.description.room
@@ -136,33 +135,22 @@ class Renderer:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
             radiance seen directly from lamps and from the environment, as means over each pixel's area.
         """
-        fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
-        centres = camera.centres().astype(np.float32)
-        point, normal, albedo, valid = launch(self._gbuffer, {"position": ("Point2f", centres)}, **fixed)
+        corners = np.floor(camera.centres()).astype(np.float32)
+        lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
+        fixed = {"masks": self.scene.masks, "sky": self.scene.environment is not None, **self._camera_values(camera)}
+        fixed["size"] = mi.Vector2f(camera.width, camera.height)
+        dr.make_opaque(fixed["size"])
+        point, normal, albedo, emission, valid = launch(self._gbuffer, lanes, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
-        mask = valid[:, None]
-        albedo, emission = np.where(mask, albedo, 0), np.zeros((len(centres), 3), np.float32)
-        for kernel, values, pixels in (
-            (self._albedo, albedo, _varies(albedo, camera)),
-            (self._emission, emission, self._may_see_light(camera, ~valid)),
-        ):
-            if pixels.any():
-                (values[pixels],) = launch(kernel, {"corner": ("Point2f", np.floor(centres[pixels]))}, **fixed)
-        buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(mask, normal, 0)}
+        buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(valid[:, None], normal, 0)}
         buffers |= {"albedo": albedo, "emission": emission}
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
-    def _may_see_light(self, camera: Camera, escapes: np.ndarray) -> np.ndarray:
-        """Return (H W,) bool: the pixels that may have emission. The others need no rays for it.
-
-        A pixel may see a lamp if it covers part of the lamp's bounding box. It may see the environment if the ray
-        through its own centre or the centre of a neighbour `escapes` (H W,).
-        """
-        sees = np.zeros(len(escapes), bool)
-        if self.scene.environment is not None:
-            sees |= ndimage.maximum_filter(escapes.reshape(camera.height, camera.width), 3).ravel()
+    def _may_see_lamp(self, camera: Camera) -> np.ndarray:
+        """Return (H W,) bool: the pixels that cover part of a lamp's bounding box. No others have a lamp's emission."""
+        sees = np.zeros(camera.width * camera.height, bool)
         directions = camera.view_directions().reshape(3, -1)
         diagonal = np.hypot(1 / camera.matrix[0, 0], 1 / camera.matrix[1, 1])  # of a pixel, at depth 1
         for lamp in self._lamps:
@@ -252,22 +240,6 @@ class Renderer:
         return launch(self._photons[emitter], lanes, emitter=self.emitters[emitter], **fixed)
 
 
-def _varies(albedo: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return (H W,) bool: the pixels at an edge or in a texture, by the albedo (H W, 3) at pixel centres.
-
-    The others, half of an image at 64x64 and more at higher resolutions, need no further rays. The image's border
-    counts as an edge, because the neighbours outside are not known.
-    """
-    image = albedo.reshape(camera.height, camera.width, 3)
-    varies = np.ones(image.shape[:2], bool)
-    varies[1:-1, 1:-1] = False
-    for lines, marks in ((image, varies), (image.swapaxes(0, 1), varies.T)):
-        differs = (np.abs(lines[1:] - lines[:-1]) > _UNIFORM).any(-1)
-        marks[1:] |= differs
-        marks[:-1] |= differs
-    return varies.ravel()
-
-
 def sensor_to_world(camera: Camera, units_per_metre: float) -> Any:
     """Return the transform of Mitsuba's camera, which looks along +z like ours, but whose x points left and y up."""
     view_to_world = np.linalg.inv(camera.world_to_view.astype(float))
@@ -295,39 +267,61 @@ def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image
     return (value, *(part for splat in splats for part in splat))
 
 
-def _gbuffer(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
-    interaction = first_surface(scene, _ray(position, **camera), masks)
-    valid = interaction.is_valid()
-    albedo = diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
-    return interaction.p, interaction.sh_frame.n, albedo, valid
+def _gbuffer(scene: Any, masks: bool, sky: bool, corner: Any, lit: Any, size: Any, **camera: Any) -> tuple:
+    """Return point, normal, albedo, emission and whether the ray hit. `lit` is 0 in pixels that see no lamp.
 
+    It is one kernel because, however few rays a kernel traces, Dr.Jit needs 2 to 4 ms to look at the whole scene.
+    """
+    trace = lambda place: first_surface(scene, _ray(corner + place, **camera), masks)
+    centre = trace(0.5)
+    valid, albedo = centre.is_valid(), _albedo(centre)
+    varies, escapes = True, True  # A scalar kernel knows only its own pixel.
+    if is_jit():
+        dr.eval(valid, albedo)
+        varies, escapes = _compare_neighbours(valid, albedo, corner, size)
+    albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
+    lit = (lit > 0) | (escapes & sky)
 
-def _pixel_mean(value: Callable, side: int, scene: Any, masks: bool, corner: Any, **camera: Any) -> tuple:
-    """Return the mean of the colour `value(interaction)` over side x side rays in each pixel."""
-
-    def step(k: Any, total: Any) -> tuple:
-        place = (mi.Point2f(mi.Float(k % side), mi.Float(k // side)) + 0.5) / side
-        return k + 1, total + value(first_surface(scene, _ray(corner + place, **camera), masks))
-
-    # An unrolled loop takes a minute to compile in a large scene and runs no faster.
-    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: k < side**2, step)
-    return (total / side**2,)
-
-
-def _albedo(scene: Any, **fixed: Any) -> tuple:
-    def albedo(interaction: Any) -> Any:
-        valid = interaction.is_valid()
-        return diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
-
-    return _pixel_mean(albedo, _ALBEDO_SIDE, scene, **fixed)
-
-
-def _emission(scene: Any, **fixed: Any) -> tuple:
     def emission(interaction: Any) -> Any:
         emitter = interaction.emitter(scene)  # the environment if the ray escapes
         return mi.Color3f(0) if emitter is None else mi.Color3f(emitter.eval(interaction))
 
-    return _pixel_mean(emission, _EMISSION_SIDE, scene, **fixed)
+    return centre.p, centre.sh_frame.n, albedo, _pixel_mean(trace, emission, _EMISSION_SIDE, lit), valid
+
+
+def _albedo(interaction: Any) -> Any:
+    valid = interaction.is_valid()
+    return diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
+
+
+def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any) -> tuple[Any, Any]:
+    """Return whether each pixel is at an edge or in a texture, and whether a ray escapes from it or from a neighbour.
+
+    The pixels that are not at an edge, half of an image at 64x64 and more at higher resolutions, need no further rays.
+    The image's border counts as an edge, because the neighbours outside are not known.
+    """
+    varies, escapes = mi.Bool(False), ~valid
+    for dx, dy in itertools.product((-1, 0, 1), repeat=2):
+        x, y = corner.x + dx, corner.y + dy
+        inside = (x >= 0) & (y >= 0) & (x < size.x) & (y < size.y)
+        index = mi.UInt32(y * size.x + x)
+        escapes |= inside & ~dr.gather(mi.Bool, valid, index, inside)
+        if abs(dx) + abs(dy) == 1:
+            differs = dr.abs(dr.gather(mi.Color3f, albedo, index, inside) - albedo) > _UNIFORM
+            varies |= ~inside | dr.any(differs)
+    return varies, escapes
+
+
+def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any:
+    """Return the mean of the colour `value(interaction)` over side x side rays in each active pixel, else 0."""
+
+    def step(k: Any, total: Any) -> tuple:
+        place = (mi.Point2f(mi.Float(k % side), mi.Float(k // side)) + 0.5) / side
+        return k + 1, total + value(trace(place))
+
+    # An unrolled loop takes a minute to compile in a large scene and runs no faster.
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: active & (k < side**2), step)
+    return total / side**2
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:
