@@ -141,12 +141,12 @@ def _draw(directory: str | Path, megabytes: int | None = None) -> None:
 def _render(options: argparse.Namespace) -> None:
     if options.demo == bool(options.checkpoint) or (options.checkpoint and not options.scene):
         raise UserError("give either CKPT and SCENE or --demo; see nlt render --help")
-    from nlt.evaluation.render import DEMO, render
+    from nlt.evaluation.render import DEMO, DEMO_SCENE, render
 
     demo = options.demo
     render(
-        checkpoint=str(DEMO) if demo else options.checkpoint,
-        scene=DEMO.stem if demo else options.scene,
+        checkpoints=DEMO if demo else {"": options.checkpoint},
+        scene=DEMO_SCENE if demo else options.scene,
         output=options.output,
         state=options.state,
         light=options.light or ("turntable" if demo and options.state.isdecimal() else None),
@@ -290,7 +290,7 @@ def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="checkpoint, or NAME.safetensors from nlt export")
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=_SCENE)
-    parser.add_argument("--demo", action="store_true", help="use the model that comes with nlt and move the light")
+    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt and move the light")
     parser.add_argument("--state", default="0", help="index of a random state, or a YAML file (default: 0)")
     parser.add_argument("--light", choices=("turntable",), help="move the light around (default: as in --state)")
     parser.add_argument(
@@ -314,7 +314,7 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
         help="checkpoint, NAME.safetensors from nlt export, or results directory of nlt compare",
     )  # fmt: skip
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=f"{_SCENE} (default: the first of the training)")
-    parser.add_argument("--demo", action="store_true", help="use the model that comes with nlt")
+    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine)")
     parser.add_argument(
         "--port", type=_whole, default=8080, help="port to listen at; 0 takes a free one (default: 8080)"

@@ -1,9 +1,12 @@
-"""Make the model of `nlt render --demo` from a finished training: safetensors, and a manifest of its origin.
+"""Make a model of `nlt render --demo` from a finished training: safetensors, and a card of its origin and metrics.
 
     nlt generate --config data/demo --config scale/pretrained
-    nlt fit --config data/demo --config model/photon_splat \
-        --config scale/pretrained --trainer.default_root_dir runs/pretrained
-    python scripts/pretrained.py runs/pretrained/lightning_logs/version_0/checkpoints/*.ckpt $(git rev-parse HEAD)
+    for METHOD in guided_1spp nlt_photons; do
+        nlt fit --config data/demo --config model/$METHOD --config scale/pretrained \
+            --trainer.default_root_dir runs/pretrained/$METHOD
+        python scripts/pretrained.py runs/pretrained/$METHOD/lightning_logs/version_0/checkpoints/*.ckpt \
+            $(git rev-parse HEAD)
+    done
 """
 
 import dataclasses
@@ -21,21 +24,25 @@ from nlt.models.factory import read_checkpoint
 from nlt.models.policy import default_device
 from nlt.training import run_lightning
 
-CONFIGS = ("data/demo", "model/photon_splat", "scale/pretrained")
-
 
 def main(checkpoint: str, commit: str) -> None:
     """Evaluate a checkpoint that was trained at `commit` and write it to where `nlt render --demo` finds it."""
-    begun, configs = origin(), [f"--config={file}" for file in CONFIGS]
-    run = read_configs([str(Path(checkpoint).absolute().parents[1] / "config.yaml")])
+    run_folder = Path(checkpoint).absolute().parents[1]
+    name = run_folder.parents[1].name
+    (file,) = (Path(path) for path in DEMO.values() if Path(path).stem == name)
+    used = ("data/demo", f"model/{name}", "scale/pretrained")
+    begun, configs = origin(), [f"--config={config}" for config in used]
+    run = read_configs([str(run_folder / "config.yaml")])
+    seconds = Path(checkpoint).stat().st_mtime - (run_folder / "config.yaml").stat().st_mtime
     trainer = run_lightning(["test", *configs, f"--ckpt_path={checkpoint}", "--trainer.logger=false"]).trainer
     method, spec, points = load_trained(checkpoint)
-    save_trained(method, spec, points, str(DEMO))
-    manifest = {
+    save_trained(method, spec, points, str(file))
+    card = {
         **begun,
         "command": f"python scripts/pretrained.py {Path(checkpoint).name} {commit}",
-        "training_command": "nlt fit " + " ".join(f"--config {file}" for file in CONFIGS),
+        "training_command": "nlt fit " + " ".join(f"--config {config}" for config in used),
         "trained_at_commit": commit,
+        "minutes": round(seconds / 60, 1),
         **{name: value for name, value in surroundings(default_device()).items() if name != "clock"},
         "seed": run["seed_everything"],
         "model": run["model"],
@@ -44,10 +51,10 @@ def main(checkpoint: str, commit: str) -> None:
         "steps": read_checkpoint(checkpoint)["global_step"],
         "dataset": dataclasses.asdict(spec),
         "parameters": sum(p.numel() for p in method.parameters()),
-        "sha256": hashlib.sha256(DEMO.read_bytes()).hexdigest(),
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
         "test": {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()},
     }
-    write_bytes(DEMO.with_suffix(".json"), (json.dumps(manifest, indent=1) + "\n").encode())
+    write_bytes(file.with_suffix(".json"), (json.dumps(card, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

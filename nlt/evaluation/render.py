@@ -3,15 +3,16 @@
 import dataclasses
 import hashlib
 import io
+import itertools
 import json
 import os
 import statistics
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
@@ -42,7 +43,13 @@ from nlt.scenes.description import load_description
 from nlt.scenes.state import SceneState
 from nlt.scenes.trajectory import cameras, states
 
-DEMO = Path(__file__).with_name("pretrained") / "living_room.safetensors"
+_PRETRAINED = Path(__file__).with_name("pretrained")
+# The models that come with nlt, by the name that is shown; the first is the better one.
+DEMO = {
+    "Guided (1 spp)": str(_PRETRAINED / "guided_1spp.safetensors"),
+    "the paper's full model": str(_PRETRAINED / "nlt_photons.safetensors"),
+}
+DEMO_SCENE = "living_room"
 MANIFEST = "render.json"
 _DATASETS = "datasets"  # folder in which stored datasets are looked up
 _MODEL, _TRACED = 0, 1  # seeds of photons and of path tracing
@@ -153,30 +160,8 @@ class ModelRenderer:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def open_model(
-    checkpoint: str,
-    trained: tuple[RenderingModule, DatasetSpec, list[int]],
-    index: int,
-    render: SampleRenderer | None = None,
-) -> ModelRenderer:
-    """Return the renderer of a method that `load_trained` has loaded, on the default device and by its fast paths.
-
-    Raises:
-        UserError: the method has embeddings of other points than those of the scene `index` here.
-    """
-    method, spec, checksums = trained
-    device = default_device()
-    model = ModelRenderer(accelerate(method, Policy.for_device(device), device), spec, index, device, render)
-    if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[index]:
-        raise UserError(
-            f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
-            f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
-        )
-    return model
-
-
 def render(
-    checkpoint: str,
+    checkpoints: Mapping[str, str],
     scene: str,
     output: str,
     state: str = "0",
@@ -190,20 +175,21 @@ def render(
     layers: bool = False,
     steady: bool = False,
 ) -> Path:
-    """Write a video of a scene: the method left, path tracing right, captions with the measured time per frame.
+    """Write a video of a scene: the methods left, path tracing right, captions with the measured time per frame.
 
     Frames are written one by one; a repeated command keeps those that exist.
 
     Args:
-        checkpoint: a checkpoint of `nlt fit` in its run, or safetensors of `nlt export`.
-        scene: a scene of the method's dataset; any scene for a method without point embeddings.
+        checkpoints: checkpoints of `nlt fit` in their runs, or safetensors of `nlt export`, by the names shown; all of
+            one experiment. An empty name stands for the name of the method's class.
+        scene: a scene of the methods' datasets; any scene for methods without point embeddings.
         output: VIDEO.mp4, next to which VIDEO.png, the first frame, and VIDEO.json, the manifest, are written; or a
             folder for PNGs.
         state, light, camera_path: see nlt/scenes/trajectory.py.
         resolution: width and height of each of the two images.
-        spp: samples per pixel of path tracing; None for as many as the method's time allows, 0 for no path tracing.
+        spp: samples per pixel of path tracing; None for as many as the time of the slowest method allows, 0 for none.
         photons: number of photons to cast (default: as in the dataset).
-        steady: blend each of the method's frames with those before it (nlt/models/steady.py).
+        steady: blend each of a method's frames with those before it (nlt/models/steady.py).
         layers: also write a multi-layer EXR (nlt/rendering/exr.py) of each frame; the output must be a folder.
 
     Raises:
@@ -215,16 +201,15 @@ def render(
     if video and layers:
         raise UserError(f"--exr: -o must be a folder, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
-    method, spec, checksums = load_trained(checkpoint)
-    spec, index = with_scene(method, spec, scene, checkpoint)
-    spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
+    loaded = load_models(checkpoints, scene, photons)
+    *_, spec, index = next(iter(loaded.values()))
     description = spec.descriptions[index]
     views = cameras(description, camera_path, frames, *resolution)
     scene_states = states(description, spec.experiment, state, light, frames)
     key = _digest(
-        Path(checkpoint).read_bytes(),
+        *(Path(checkpoint).read_bytes() for checkpoint in checkpoints.values()),
         description.digest.encode(),
-        json.dumps([dataclasses.asdict(spec), resolution, spp, steady], sort_keys=True).encode(),
+        json.dumps([dataclasses.asdict(spec), resolution, spp, steady, [*loaded]], sort_keys=True).encode(),
         *(part for v in views for part in (v.matrix.tobytes(), v.world_to_view.tobytes())),
         *(moment.key for moment in scene_states),
     )
@@ -233,34 +218,38 @@ def render(
     is_done = lambda name: name.exists() and (not layers or name.with_suffix(".exr").exists())
     missing = [k for k, name in enumerate(names) if not is_done(name)]
     if missing:
-        model = open_model(checkpoint, (method, spec, checksums), index)
-        model.steady = Steady() if steady else None
-        policy = Policy.for_device(model.device)
+        models = open_models(loaded)
+        first = next(iter(models.values()))
         with torch.no_grad():
             if not manifest:
-                times = _measure(model, scene_states, views, spp)
+                _begin(models, steady)
+                device = default_device()
                 manifest = {
                     "key": key,
                     **provenance,
-                    **surroundings(model.device, policy),
-                    "checkpoint": checkpoint,
-                    **times,
+                    **surroundings(device, Policy.for_device(device)),
+                    "checkpoints": {name: each.checkpoint for name, each in loaded.items()},
+                    **_measure(models, scene_states, views, spp),
                 }
                 manifest |= {"scene": scene, "experiment": spec.experiment, "frames": frames, "resolution": resolution}
                 manifest["steady"] = steady
                 write_bytes(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+            _begin(models, steady)
             if steady:  # the frames before a missing one are blended into it
-                model.steady = Steady()
-                for k in range(missing[0]):
+                for k, model in itertools.product(range(missing[0]), models.values()):
                     model.frame(scene_states[k], views[k], k)
                 missing = list(range(missing[0], frames))
             done = frames - len(missing)
             for k in tqdm(missing, "rendering", frames, unit="frame", file=sys.stderr, initial=done):
-                frame = _panels(model, scene_states[k], views[k], k, manifest)
-                write_bytes(names[k], _frame_png(frame, description.exposure, manifest))
+                place = scene_states[k], views[k]
+                images = [model.frame(*place, k) for model in models.values()]
+                if manifest["spp"]:
+                    images.append(first.traced(*place, manifest["spp"], k))
+                panels = [image[0].cpu().numpy() for image in images]
+                write_bytes(names[k], _frame_png(panels, description.exposure, manifest))
                 if layers:
-                    content = exr(frame | model.gbuffer(scene_states[k], views[k]))
-                    write_bytes(names[k].with_suffix(".exr"), content)
+                    stored = {"radiance": panels[0]} | ({"path_tracing": panels[-1]} if manifest["spp"] else {})
+                    write_bytes(names[k].with_suffix(".exr"), exr(stored | first.gbuffer(*place)))
     written = Path(output)
     if video:
         write_video(written, (np.asarray(Image.open(name)) for name in names), fps)
@@ -269,9 +258,60 @@ def render(
         for file in (*names, folder / MANIFEST):
             file.unlink()
         folder.rmdir()
-    print(f"{written}: {manifest['method']} {_ms(manifest['model_ms'])} per frame", end="")
-    print(f", path tracing with {manifest['spp']} spp {_ms(manifest['path_tracing_ms'])}" if manifest["spp"] else "")
+    print(f"{written}: {'; '.join(_captions(manifest))}")
     return written
+
+
+class Loaded(NamedTuple):
+    """A trained method, the checksums of its points, and the scene that it will draw: number `scene` in `spec`."""
+
+    checkpoint: str
+    method: RenderingModule
+    checksums: list[int]
+    spec: DatasetSpec
+    scene: int
+
+
+def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int | None = None) -> dict[str, Loaded]:
+    """Load what `open_models` opens, for `scene` or the first one of each training; see `render`.
+
+    Raises:
+        UserError: a file is missing or wrong, or the scene does not suit a method.
+    """
+    loaded = {}
+    for name, checkpoint in checkpoints.items():
+        method, spec, checksums = load_trained(checkpoint)
+        spec, index = with_scene(method, spec, scene or spec.scenes[0], checkpoint)
+        spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
+        loaded[name or type(method).__name__] = Loaded(checkpoint, method, checksums, spec, index)
+    return loaded
+
+
+def open_models(loaded: Mapping[str, Loaded]) -> dict[str, ModelRenderer]:
+    """Return the renderers of loaded methods, on the default device and by their fast paths; they share a scene.
+
+    Raises:
+        UserError: a method has embeddings of other points than those of its scene here.
+    """
+    models: dict[str, ModelRenderer] = {}
+    render, device = None, default_device()
+    for name, (checkpoint, method, checksums, spec, scene) in loaded.items():
+        shared = render if render and (render.spec, render.index) == (spec, scene) else None
+        fast = accelerate(method, Policy.for_device(device), device)
+        models[name] = model = ModelRenderer(fast, spec, scene, device, shared)
+        render = model.render
+        if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[scene]:
+            raise UserError(
+                f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
+                f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
+            )
+    return models
+
+
+def _begin(models: Mapping[str, ModelRenderer], steady: bool) -> None:
+    """Let each method forget the frames before, if it blends its own with them."""
+    for model in models.values():
+        model.steady = Steady() if steady else None
 
 
 def with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoint: str) -> tuple[DatasetSpec, int]:
@@ -322,19 +362,20 @@ def _read_manifest(folder: Path, key: str) -> dict[str, Any]:
 
 
 def _measure(
-    model: ModelRenderer, scene_states: list[SceneState], views: list[Camera], spp: int | None
+    models: Mapping[str, ModelRenderer], scene_states: list[SceneState], views: list[Camera], spp: int | None
 ) -> dict[str, Any]:
-    """Return the median milliseconds per frame of model and path tracing after warm-up, and the latter's spp."""
+    """Return the median milliseconds per frame of models and path tracing after warm-up, and the latter's spp."""
     places = [(scene_states[k % len(views)], views[k % len(views)]) for k in range(_WARM + _TIMED)]
     cost = lambda work: 1e3 * statistics.median([_seconds(work, *place) for place in places][_WARM:])
-    times: dict[str, Any] = {"method": type(model.method).__name__, "model_ms": cost(model.frame)}
-    traced = lambda count: cost(lambda moment, view: model.traced(moment, view, count, 0))
+    milliseconds = {name: cost(model.frame) for name, model in models.items()}
+    first = next(iter(models.values()))
+    traced = lambda count: cost(lambda moment, view: first.traced(moment, view, count, 0))
     if spp is None:
         few, many = traced(_FEW), traced(_MANY)
         sample_ms = max((many - few) / (_MANY - _FEW), 1e-3)
-        spp = min(max(_FEW, round(_FEW + (times["model_ms"] - few) / sample_ms)), _MAX_SPP)
+        spp = min(max(_FEW, round(_FEW + (max(milliseconds.values()) - few) / sample_ms)), _MAX_SPP)
     clock = {"batch": 1, "warm_up_frames": _WARM, "timed_frames": _TIMED}
-    times |= {"spp": spp, "path_tracing_ms": traced(spp) if spp else None}
+    times = {"model_ms": milliseconds, "spp": spp, "path_tracing_ms": traced(spp) if spp else None}
     return {**times, "clock": clock, "load_average": os.getloadavg()}
 
 
@@ -348,26 +389,22 @@ def _seconds(work: Any, *arguments: Any) -> float:
     return time.perf_counter() - start
 
 
-def _panels(
-    model: ModelRenderer, state: SceneState, view: Camera, k: int, manifest: dict[str, Any]
-) -> dict[str, np.ndarray]:
-    """Return a frame's radiance (3, H, W) by the method and, unless its spp are 0, by path tracing."""
-    panels = {"radiance": model.frame(state, view, k)}
-    if manifest["spp"]:
-        panels["path_tracing"] = model.traced(state, view, manifest["spp"], k)
-    return {name: image[0].cpu().numpy() for name, image in panels.items()}
-
-
-def _frame_png(images: dict[str, np.ndarray], exposure: float, manifest: dict[str, Any]) -> bytes:
-    """Return a frame as a PNG of even size: the images (3, H, W) next to each other, with captions below."""
-    captions = [f"{manifest['method']}{', steady' * manifest['steady']}, {_ms(manifest['model_ms'])}"]
+def _captions(manifest: Mapping[str, Any]) -> list[str]:
+    """Return what to write below each panel: the method and its time per frame."""
+    steady = ", steady" * manifest["steady"]
+    captions = [f"{name}{steady}, {_ms(value)}" for name, value in manifest["model_ms"].items()]
     if manifest["spp"]:
         captions.append(f"path tracing, {manifest['spp']} spp, {_ms(manifest['path_tracing_ms'])}")
-    _, rows, columns = images["radiance"].shape
+    return captions
+
+
+def _frame_png(images: Sequence[np.ndarray], exposure: float, manifest: Mapping[str, Any]) -> bytes:
+    """Return a frame as a PNG of even size: the images (3, H, W) next to each other, with captions below."""
+    _, rows, columns = images[0].shape
     width, height = len(images) * columns, rows + _CAPTION
     sheet = Image.new("RGB", (width + width % 2, height + height % 2))
     draw = ImageDraw.Draw(sheet)
-    for column, (radiance, text) in enumerate(zip(images.values(), captions, strict=True)):
+    for column, (radiance, text) in enumerate(zip(images, _captions(manifest), strict=True)):
         sheet.paste(Image.fromarray(shown(radiance, exposure)), (column * columns, 0))
         size = 12.0
         while draw.textlength(text, font_size=size) > columns - 4 and size > 4:

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.errors import UserError
-from nlt.evaluation.export import load_trained
 from nlt.evaluation.paper import label
-from nlt.evaluation.render import DEMO, ModelRenderer, open_model, with_scene
+from nlt.evaluation.render import DEMO, load_models, open_models
 from nlt.evaluation.results import MANIFEST, OK, RUNS, load
 from nlt.scenes.camera import Camera
 from nlt.scenes.state import SceneState
@@ -21,19 +20,12 @@ class Pictures:
     """Draws one scene by any of `names`. All of it must run in one thread, because Mitsuba and PyTorch do."""
 
     def __init__(self, source: str | None, scene: str | None) -> None:
-        """Load a checkpoint, or the first training of each method in a results directory; None loads the demo's model.
+        """Load a checkpoint, or the first training of each method in a results directory; None loads the demo's models.
 
         Raises:
             UserError: a file is missing or wrong, or the scene does not suit a method.
         """
-        self._models: dict[str, ModelRenderer] = {}
-        render = None
-        for name, checkpoint in find_checkpoints(source).items():
-            method, spec, checksums = load_trained(checkpoint)
-            spec, index = with_scene(method, spec, scene or spec.scenes[0], checkpoint)
-            shared = render if render and (render.spec, render.index) == (spec, index) else None
-            model = open_model(checkpoint, (method, spec, checksums), index, shared)
-            self._models[name or type(method).__name__], render = model, model.render
+        self._models = open_models(load_models(find_checkpoints(source), scene))
         self._any = next(iter(self._models.values()))
         self.scene = self._any.render.scene
         self.names = [*self._models, DENOISED, TRACED, REFERENCE]
@@ -73,7 +65,7 @@ def find_checkpoints(source: str | None) -> dict[str, str]:
         UserError: the results are incomplete, or a training that they name is gone.
     """
     if source is None:
-        return {"": str(DEMO)}
+        return DEMO
     if not Path(source).is_dir():
         return {"": source}
     from nlt.evaluation.trainings import newest_checkpoint  # here, because it takes a second that --demo can do without

@@ -6,15 +6,16 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
 
-from nlt.evaluation.export import load_trained
-from nlt.evaluation.render import DEMO, open_model, shown
+from nlt.evaluation.render import DEMO, load_models, open_models, shown
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.scenes.trajectory import cameras, states
 from nlt.view.page import clamp
@@ -28,8 +29,8 @@ PATIENCE = 600  # seconds to wait on a busy machine
 NEAR = 0.02  # mean difference of displayed values in [0, 1]: the browser interpolates, and axes cover a corner
 
 
-@pytest.fixture(scope="module")
-def process():
+@contextmanager
+def viewing():
     command = [sys.executable, "-m", "nlt.cli", "view", "--demo", "--port", "0", "--resolution", str(FINEST)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         url = next(found[1] for line in process.stdout if (found := re.search(r"nlt view: (http://127\S+)", line)))
@@ -37,10 +38,20 @@ def process():
         process.kill()
 
 
+def ends_cleanly(process):
+    _, error = process.popen.communicate()
+    return process.popen.returncode == 0 and "Traceback" not in error
+
+
+@pytest.fixture(scope="module")
+def process():
+    with viewing() as process:
+        yield process
+
+
 @pytest.fixture(scope="module")
 def model():
-    trained = load_trained(str(DEMO))
-    return open_model(str(DEMO), trained, 0)
+    return next(iter(open_models(load_models(DEMO, None)).values()))
 
 
 @pytest.fixture
@@ -212,7 +223,23 @@ def test_light_method_and_second_client(open_page, model):
     assert (light.box[0] - 1e-4 <= light.centre + state.translation[-1]).all()
 
 
-def test_ends_cleanly(process):
-    process.popen.send_signal(signal.SIGINT)
-    _, error = process.popen.communicate()
-    assert process.popen.returncode == 0 and "Traceback" not in error
+def test_saves_what_it_shows_and_quits(open_page, model, process):
+    page = open_page()
+    page.choose("drag", "none")
+    picture = page.shows()
+    state, camera = page.asked()
+    png = np.asarray(Image.open(page.saved("PNG")["view.png"])) / 255
+    assert np.abs(png - picture).mean() < 1 / 255 and png.std() > 0.05
+    with OpenEXR.File(str(page.saved("EXR")["view.exr"]), separate_channels=True) as file:
+        layers = {name: channel.pixels for name, channel in file.channels().items()}
+    radiance = np.stack([layers[channel] for channel in "RGB"])
+    assert np.abs(shown(radiance, model.render.description.exposure) / 255 - png).max() <= 1 / 255
+    np.testing.assert_allclose(layers["Depth.Z"], model.gbuffer(state, camera)["depth"][0], rtol=1e-4)
+    page.page.get_by_role("button", name="quit", exact=True).click()
+    assert ends_cleanly(process)
+
+
+def test_interrupted():
+    with viewing() as process:
+        process.popen.send_signal(signal.SIGINT)
+        assert ends_cleanly(process)
