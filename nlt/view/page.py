@@ -43,9 +43,9 @@ def view(source: str | None, scene: str | None, host: str, port: int, resolution
     except OSError as error:
         raise UserError(f"--host, --port: {host}:{port}: {error.strerror}; give another address") from None
     page = Page(Pictures(source, scene), host, port, resolution)
-    print(f"nlt view: http://{host}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: page.close())
+    print(f"nlt view: http://{host}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
     try:
         page.run()
     finally:

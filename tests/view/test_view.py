@@ -226,6 +226,7 @@ def test_light_method_and_second_client(open_page, model):
 def test_saves_what_it_shows_and_quits(open_page, model, process):
     page = open_page()
     page.choose("drag", "none")
+    page.choose("left", next(iter(DEMO)))  # all clients share what another one chose
     picture = page.shows()
     state, camera = page.asked()
     png = np.asarray(Image.open(page.saved("PNG")["view.png"])) / 255
