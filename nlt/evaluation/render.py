@@ -186,7 +186,7 @@ def render(
         output: VIDEO.mp4, next to which VIDEO.png, the first frame, and VIDEO.json, the manifest, are written; or a
             folder for PNGs.
         state, light, camera_path: see nlt/scenes/trajectory.py.
-        resolution: width and height of each of the two images.
+        resolution: width and height of each image.
         spp: samples per pixel of path tracing; None for as many as the time of the slowest method allows, 0 for none.
         photons: number of photons to cast (default: as in the dataset).
         steady: blend each of a method's frames with those before it (nlt/models/steady.py).
@@ -273,7 +273,7 @@ class Loaded(NamedTuple):
 
 
 def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int | None = None) -> dict[str, Loaded]:
-    """Load what `open_models` opens, for `scene` or the first one of each training; see `render`.
+    """Load what `open_models` opens, for `scene`, or for the first one of the first training; see `render`.
 
     Raises:
         UserError: a file is missing or wrong, or the scene does not suit a method.
@@ -281,7 +281,8 @@ def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int 
     loaded = {}
     for name, checkpoint in checkpoints.items():
         method, spec, checksums = load_trained(checkpoint)
-        spec, index = with_scene(method, spec, scene or spec.scenes[0], checkpoint)
+        scene = scene or spec.scenes[0]
+        spec, index = with_scene(method, spec, scene, checkpoint)
         spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
         loaded[name or type(method).__name__] = Loaded(checkpoint, method, checksums, spec, index)
     return loaded
