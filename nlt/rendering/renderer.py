@@ -278,7 +278,7 @@ def _gbuffer(scene: Any, masks: bool, sky: bool, corner: Any, lit: Any, size: An
     varies, escapes = True, True  # A scalar kernel knows only its own pixel.
     if is_jit():
         dr.eval(valid, albedo)
-        varies, escapes = _compare_neighbours(valid, albedo, corner, size)
+        varies, escapes = _compare_neighbours(valid, albedo, corner, size, sky)
     albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
     lit = (lit > 0) | (escapes & sky)
 
@@ -294,7 +294,7 @@ def _albedo(interaction: Any) -> Any:
     return diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
 
 
-def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any) -> tuple[Any, Any]:
+def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
     """Return whether each pixel is at an edge or in a texture, and whether a ray escapes from it or from a neighbour.
 
     The pixels that are not at an edge, half of an image at 64x64 and more at higher resolutions, need no further rays.
@@ -305,7 +305,8 @@ def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any) -> tupl
         x, y = corner.x + dx, corner.y + dy
         inside = (x >= 0) & (y >= 0) & (x < size.x) & (y < size.y)
         index = mi.UInt32(y * size.x + x)
-        escapes |= inside & ~dr.gather(mi.Bool, valid, index, inside)
+        if sky:
+            escapes |= inside & ~dr.gather(mi.Bool, valid, index, inside)
         if abs(dx) + abs(dy) == 1:
             differs = dr.abs(dr.gather(mi.Color3f, albedo, index, inside) - albedo) > _UNIFORM
             varies |= ~inside | dr.any(differs)
