@@ -111,7 +111,7 @@ class Comparison:
         )  # fmt: skip
         for method in found.trained:
             check_configs([str(path) for path in files[method]])
-            elsewhere = found.training_specs[method] is not spec
+            elsewhere = found.training_specs[method] != spec
             if elsewhere and build(found.configs[method], files[method][1]).has_point_embeddings:
                 raise UserError(
                     f"{files[method][-1]}: data.dataset: {method} has embeddings of the points of its training scenes; "
@@ -142,9 +142,8 @@ class Comparison:
 
     @cached_property
     def training_specs(self) -> dict[str, DatasetSpec]:
-        """The dataset that each trained method is trained on; `spec` itself where it is the compared one."""
-        specs = {method: load_spec([str(path) for path in self.files[method]])[0] for method in self.trained}
-        return {method: self.spec if spec == self.spec else spec for method, spec in specs.items()}
+        """The dataset that each trained method is trained on."""
+        return {method: load_spec([str(path) for path in self.files[method]])[0] for method in self.trained}
 
     def runs(self, method: str) -> Path:
         """Return the directory of a method's trainings."""

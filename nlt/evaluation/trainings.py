@@ -100,11 +100,12 @@ def generate_datasets(
     comparison: Comparison, workers: int | None = None, scheduler: str = "local", slurm: Mapping[str, str] | None = None
 ) -> AnyPath:
     """Render what is missing of the compared dataset and of those that its methods train on; return the former."""
-    dataset = generate(comparison.spec, comparison.root, workers, scheduler, slurm)
+    specs = [comparison.spec]
     for spec in comparison.training_specs.values():
-        if spec is not comparison.spec:
-            generate(spec, comparison.root, workers, scheduler, slurm)
-    return dataset
+        if spec not in specs:
+            specs.append(spec)
+    directories = [generate(spec, comparison.root, workers, scheduler, slurm) for spec in specs]
+    return directories[0]
 
 
 def train(

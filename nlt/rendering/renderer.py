@@ -295,7 +295,7 @@ def _albedo(interaction: Any) -> Any:
 
 
 def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
-    """Return whether each pixel is at an edge or in a texture, and whether a ray escapes from it or from a neighbour.
+    """Return whether each pixel is at an edge or in a texture, and whether it or, with a sky, a neighbour sees no surface.
 
     The pixels that are not at an edge, half of an image at 64x64 and more at higher resolutions, need no further rays.
     The image's border counts as an edge, because the neighbours outside are not known.
