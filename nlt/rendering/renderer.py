@@ -295,8 +295,9 @@ def _albedo(interaction: Any) -> Any:
 
 
 def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
-    """Return whether each pixel is at an edge or in a texture, and whether it or, with a sky, a neighbour sees no surface.
+    """Return two masks: pixels at an edge or in a texture, and pixels from which a ray escapes.
 
+    The second mask is for finding the sky: where there is one, the neighbours of such pixels belong to it, too.
     The pixels that are not at an edge, half of an image at 64x64 and more at higher resolutions, need no further rays.
     The image's border counts as an edge, because the neighbours outside are not known.
     """
