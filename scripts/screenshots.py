@@ -1,21 +1,31 @@
-"""Take the README's pictures of the report and the dashboard: `python scripts/screenshots.py results/NAME [docs]`.
+"""Take the pictures of the report, the dashboard and `nlt view`: `python scripts/screenshots.py results/NAME [docs]`.
 
-Writes report.png (the image viewer) and dashboard.png into the second directory. Needs playwright and chromium
-(`scripts/system-packages.sh chromium`), and the results' images; the dashboard shows the curves that runs/ has.
+Writes report.png (the report's images), dashboard.png and view.webp into the second directory. Needs playwright and
+chromium (`scripts/system-packages.sh chromium`) and the results' images; the dashboard shows the curves that runs/ has.
+Without results/NAME, it takes only the picture of `nlt view --demo`.
 """
 
 import os
+import re
 import shutil
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 from tensorboard import program
 
+from nlt.evaluation.render import DEMO, DEMO_SCENE
 from nlt.evaluation.results import load
 from nlt.report.dashboard import write_logs
 from nlt.report.draw import draw
 from nlt.report.page import PAGE
+from nlt.scenes.camera import Camera
+from nlt.scenes.description import load_description
+from nlt.view.pictures import REFERENCE
 
 
 def report(page: Page, directory: Path, path: Path) -> None:
@@ -36,17 +46,75 @@ def dashboard(page: Page, directory: Path, path: Path) -> None:
     page.screenshot(path=path)
 
 
+def view(page: Page, path: Path) -> None:
+    """Capture `nlt view --demo` three times: at rest, with a dragged light and two methods, without the table."""
+    position, target = np.array([-1.5, 1.3, 0.2]), np.array([0.5, 2.0, 0.0])  # of a camera that sees the light
+    command = [sys.executable, "-m", "nlt.cli", "view", "--demo", "--port", "0", "--resolution", "384"]
+    shots = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
+    ):
+        assert process.stdout
+        url = next(found[1] for line in process.stdout if (found := re.search(r"(http://127\S+)", line)))
+        at = lambda point: ",".join(map(str, point))
+        page.goto(f"{url}?initialCameraPosition={at(position)}&initialCameraLookAt={at(target)}")
+        page.get_by_text("frames per second,").wait_for()
+
+        def shoot() -> None:
+            page.wait_for_timeout(8000)  # until it rests
+            page.screenshot(path=Path(folder) / "shot.png")
+            shots.append(Image.open(Path(folder) / "shot.png").convert("RGB"))
+
+        def choose(label: str, option: str) -> None:
+            page.get_by_label(label, exact=True).first.click()
+            page.get_by_role("option", name=option, exact=True).click()
+
+        shoot()
+        description = load_description(DEMO_SCENE)
+        boxes = [canvas.bounding_box() for canvas in page.locator("canvas").all()]
+        box = max((box for box in boxes if box), key=lambda box: box["width"])
+        width, height = round(box["width"]), round(box["height"])
+        camera = Camera.look_at(position, target, description.up, description.fov, width, height)
+        assert description.light
+        for k, offset in enumerate((0.3, 0.8, 1.2)):  # along the handle's red arrow
+            x, y, z = description.light.centre
+            x, y, z = camera.matrix @ (camera.world_to_view @ [x + offset, y, z, 1])[:3]
+            page.mouse.move(box["x"] + x / z, box["y"] + y / z)
+            if k == 0:
+                page.mouse.down()
+        page.mouse.up()
+        choose("left", list(DEMO)[-1])
+        page.get_by_label("split", exact=True).last.fill("0.5")
+        page.keyboard.press("Enter")
+        shoot()
+        choose("drag", "none")
+        page.get_by_label("table", exact=True).first.click()
+        page.get_by_label("split", exact=True).last.fill("1")
+        page.keyboard.press("Enter")
+        choose("left", REFERENCE)
+        shoot()
+        process.terminate()
+    strip = Image.new("RGB", (shots[0].width, sum(shot.height for shot in shots)))
+    for k, shot in enumerate(shots):
+        strip.paste(shot, (0, k * shot.height))
+    strip.save(path, quality=85)
+
+
 def main() -> None:
-    directory, folder = Path(sys.argv[1]), Path((sys.argv[2:] or ["docs"])[0])
-    draw(directory)
+    directory, folder = sys.argv[1] if sys.argv[1:] else None, Path((sys.argv[2:] or ["docs"])[0])
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"] if os.geteuid() == 0 else []
         )
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(120_000)
-        report(page, directory, folder / "report.png")
-        dashboard(page, directory, folder / "dashboard.png")
+        if directory is not None:
+            draw(Path(directory))
+            report(page, Path(directory), folder / "report.png")
+            dashboard(page, Path(directory), folder / "dashboard.png")
+        page.set_viewport_size({"width": 960, "height": 480})
+        view(page, folder / "view.webp")
         browser.close()
 
 

@@ -37,6 +37,8 @@ class Views:
         self._sphere = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
         # Shapes are inside out if most rays from the camera volume hit their backs.
         rng, description = np.random.default_rng(0), scene.description
+        (low, high), room = description.camera, description.room
+        self._from_outside = room is not None and bool((low > room[1]).any() or (high < room[0]).any())
         with scene.in_state(rest_state(description, scene.experiment)):
             looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
         distance, behind, shape = (np.concatenate(column) for column in zip(*looks, strict=True))
@@ -68,14 +70,16 @@ class Views:
         """Return the shares of rays that mark a bad view, in the current state.
 
         `back` hit a surface from behind, and `nothing` hit no surface; each is the larger share of two: around the
-        camera and through the image. `near` is the share through the image that hits a surface within 0.2 m.
+        camera and through the image. Where the box of cameras lies outside the box of the room, the rays around the
+        camera do not count. `near` is the share through the image that hits a surface within 0.2 m.
         """
         side = int(np.sqrt(_RAYS))
         rows, columns = (np.mgrid[:side, :side] + 0.5) / side
         image = camera.directions(np.stack([columns.ravel() * camera.width, rows.ravel() * camera.height], 1))
         distance, behind, shape = self.look(camera.position, np.concatenate([self._sphere, image]))
         back = behind ^ np.isin(shape, self._inverted)
-        share = lambda mask: max(half.mean() for half in np.split(mask, 2))
+        around = 0 if self._from_outside else 1  # a stage that is seen from outside does not surround the camera
+        share = lambda mask: max(mask[:_RAYS].mean() * around, mask[_RAYS:].mean())
         return {"back": share(back), "near": (distance[_RAYS:] < _NEAR).mean(), "nothing": share(np.isinf(distance))}
 
     def look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:

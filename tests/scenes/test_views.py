@@ -69,3 +69,18 @@ def test_no_view_is_left(tmp_path):
     views = Views(Scene(load_description(str(file)), "fixed_lights"))
     with pytest.raises(UserError, match=r"scene.yaml: camera: none of 100 random views shows the room"):
         views.sample(16, np.random.default_rng(0))
+
+
+def test_a_stage_seen_from_outside(tmp_path):
+    """Cameras outside the room's box may have nothing behind them; those that look past the stage are turned down."""
+    camera, room = {"min": [-0.3, 2, 2], "max": [0.3, 2.5, 2.5]}, [[-1, 0, -1], [1, 1, 1]]
+    look_at = {"min": [-0.1, 0, -0.1], "max": [0.1, 0, 0.1]}
+    scene = lambda **more: Scene(
+        load_description(str(write_room(tmp_path, is_open=True, camera=camera, **more))), "static"
+    )
+    views, rng = Views(scene(look_at=look_at, room=room, fov=30)), np.random.default_rng(0)
+    assert views.sample(16, rng).position[2] > 2
+    past = {"min": [4, 0, 0], "max": [5, 0, 0]}
+    for other in (scene(look_at=past, room=room, fov=30), scene(look_at=look_at, fov=30)):
+        with pytest.raises(UserError, match="none of 100 random views shows the room"):
+            Views(other).sample(16, rng)
