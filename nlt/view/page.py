@@ -65,6 +65,7 @@ class Screen:
     client: viser.ClientHandle
     pace: Pace
     text: Any
+    aspect: float = 0.0  # of the picture that the field of view was chosen for
     place: tuple = ()  # state and camera of the last look
     moved: float = 0.0  # time of the last change of the place
     drawn: tuple = ()  # all that the picture depends on
@@ -188,14 +189,15 @@ class Page:
                 time.sleep(_POLL)
 
     def _open(self, client: viser.ClientHandle) -> Screen:
-        half = np.tan(np.radians(self.description.fov) / 2)
-        client.camera.fov = 2 * np.arctan(half / max(client.camera.aspect, 1))
         return Screen(client, Pace(self.most), client.gui.add_markdown("", order=-1))
 
     def _draw(self, screen: Screen) -> bool:
         """Show a client what it asks for; return whether there was anything to draw."""
         start = time.perf_counter()
         state, pose = self.state(), screen.client.camera
+        if pose.aspect != screen.aspect:  # also when the panel opens beside the picture
+            screen.aspect = pose.aspect
+            pose.fov = 2 * np.arctan(np.tan(np.radians(self.description.fov) / 2) / max(pose.aspect, 1))
         place = (state.key, *pose.position, *pose.look_at, pose.fov, pose.aspect)
         if place != screen.place:
             screen.place, screen.moved = place, start
