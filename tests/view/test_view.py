@@ -229,6 +229,7 @@ def test_saves_what_it_shows_and_quits(open_page, model, process):
     page.choose("left", next(iter(DEMO)))  # all clients share what another one chose
     picture = page.shows()
     state, camera = page.asked()
+    assert camera.width > camera.height and camera.fov == pytest.approx(model.render.description.fov, abs=0.5)
     png = np.asarray(Image.open(page.saved("PNG")["view.png"])) / 255
     assert np.abs(png - picture).mean() < 1 / 255 and png.std() > 0.05
     with OpenEXR.File(str(page.saved("EXR")["view.exr"]), separate_channels=True) as file:
