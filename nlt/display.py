@@ -5,9 +5,9 @@ from torch import Tensor
 
 
 def expose(radiance: Tensor, exposure: Tensor | float) -> Tensor:
-    """Return radiance (B, 3, H, W) times the exposure, (B,) or scalar; the result is linear and unclamped."""
+    """Return radiance (B, 3, H, W) times the exposure, (B,), (B, 3) or scalar; the result is linear and unclamped."""
     exposure = torch.as_tensor(exposure, dtype=radiance.dtype, device=radiance.device)
-    return radiance * exposure.reshape(-1, 1, 1, 1)
+    return radiance * (exposure[..., None, None] if exposure.ndim == 2 else exposure.reshape(-1, 1, 1, 1))
 
 
 def display(radiance: Tensor, exposure: Tensor | float) -> Tensor:

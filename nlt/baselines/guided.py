@@ -4,10 +4,12 @@ from typing import Any
 
 from torch import Tensor
 
-from nlt.models.module import Batch, join_channels, log_exposed
+from nlt.display import expose
+from nlt.models.module import Batch, join_channels
 from nlt.models.nlt import NeuralLightTransport
 
 _LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
+_DARKEST = 1e-6  # W·sr⁻¹·m⁻²; keeps the exposure of a black image finite
 
 
 class GuidedOneSample(NeuralLightTransport):
@@ -17,12 +19,18 @@ class GuidedOneSample(NeuralLightTransport):
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    def __init__(self, use_points: bool = False, use_photons: bool = False, **kwargs: Any) -> None:
+    architecture = (*NeuralLightTransport.architecture, "relative")
+
+    def __init__(
+        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, **kwargs: Any
+    ) -> None:
         """The keyword arguments are those of the base class.
 
         Args:
             use_points: use the points, as the paper's method does.
             use_photons: use the photons, as the paper's method does.
+            relative: read and predict radiance relative to the noisy image's own mean in each colour channel. Light
+                transport is linear in each channel, so the method then follows any colour and brightness of the light.
         """
         super().__init__(use_points, use_photons, **kwargs)
 
@@ -40,5 +48,21 @@ class GuidedOneSample(NeuralLightTransport):
 
     def gbuffer(self, batch: Batch) -> Tensor:
         """Return the G-buffer and the noisy radiance without lamps in view, divided by the albedo (B, 13, H, W)."""
-        reflected = (batch["noisy"] - batch["emission"]).clamp(min=0) / (batch["albedo"] + _LEAST_ALBEDO)
-        return join_channels([super().gbuffer(batch), log_exposed(reflected, batch["exposure"])])
+        noisy = expose(_reflected(batch), self._exposure(batch)).log1p()
+        return join_channels([super().gbuffer(batch), noisy])
+
+    def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
+        return super().to_radiance(batch | {"exposure": self._exposure(batch)}, channels)
+
+    def _exposure(self, batch: Batch) -> Tensor:
+        """Return the scene's exposure (B,), or that which the noisy image itself asks for in each channel (B, 3)."""
+        if not self.hparams["relative"]:
+            return batch["exposure"]
+        # This mean grows in proportion to the light, as the usual one does, but a firefly hardly changes it.
+        mean = _reflected(batch).sqrt().mean((2, 3)) ** 2
+        return 1 / mean.clamp(min=_DARKEST)
+
+
+def _reflected(batch: Batch) -> Tensor:
+    """Return the noisy radiance without lamps in view, divided by the albedo (B, 3, H, W)."""
+    return (batch["noisy"] - batch["emission"]).clamp(min=0) / (batch["albedo"] + _LEAST_ALBEDO)

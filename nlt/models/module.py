@@ -304,7 +304,7 @@ class RenderingModule(Method, L.LightningModule):
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
         saved = checkpoint["architecture"]
-        different = [name for name in self.architecture if saved[name] != self.hparams[name]]
+        different = [name for name in self.architecture if name in saved and saved[name] != self.hparams[name]]
         if different:
             raise UserError(
                 f"{path or 'given'}: checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, "

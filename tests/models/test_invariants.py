@@ -8,12 +8,13 @@ from __future__ import annotations
 import pytest
 import torch
 from synthetic import PHOTONS, POINTS, SCENES, synthetic_batch
-from test_methods import CONFIGS, build
+from test_methods import CONFIGS, SIZE, build
 
 from nlt.models.module import PROJECTION
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.projection import visible_pixels
 from nlt.models.transport import PointEmbedding
+from nlt.paths import find_config
 
 EXTRA = 32  # points and photons that are added
 
@@ -167,3 +168,16 @@ def test_a_mirrored_camera(method):
         method.hparams["one_in"] = 1
     batch, method = double(synthetic_batch(size=13)), method.double()
     torch.testing.assert_close(features(method, mirrored(batch)), features(method, batch).flip(-1))
+
+
+@pytest.mark.parametrize("name", ["guided_1spp", "guided_1spp_relative"])
+def test_colour_and_brightness_of_the_light(name):
+    """The image of a relative denoiser is as linear in each channel of the light as light transport is; no other's."""
+    method = build(find_config("model", name), more={"output": "demodulated"} | SIZE).eval()
+    batch = synthetic_batch()
+    factor = torch.tensor([0.1, 3.0, 40.0])[:, None, None]
+    brighter = batch | {field: batch[field] * factor for field in ("noisy", "emission")}
+    expected = method(batch) * factor
+    assert torch.allclose(method(brighter), expected, rtol=1e-3, atol=1e-4) == (name == "guided_1spp_relative")
+    black = method(batch | {field: torch.zeros_like(batch[field]) for field in ("noisy", "emission")})
+    assert black.isfinite().all()
