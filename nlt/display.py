@@ -7,7 +7,7 @@ from torch import Tensor
 def expose(radiance: Tensor, exposure: Tensor | float) -> Tensor:
     """Return radiance (B, 3, H, W) times the exposure, (B,), (B, 3) or scalar; the result is linear and unclamped."""
     exposure = torch.as_tensor(exposure, dtype=radiance.dtype, device=radiance.device)
-    return radiance * (exposure[..., None, None] if exposure.ndim == 2 else exposure.reshape(-1, 1, 1, 1))
+    return radiance * exposure.reshape(*exposure.shape, *[1] * (4 - exposure.ndim))
 
 
 def display(radiance: Tensor, exposure: Tensor | float) -> Tensor:

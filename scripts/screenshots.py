@@ -5,12 +5,12 @@ chromium (`scripts/system-packages.sh chromium`) and the results' images; the da
 Without results/NAME, it takes only the picture of `nlt view --demo`.
 """
 
+import io
 import os
 import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def view(page: Page, path: Path) -> None:
     position, target = np.array([2.2, 1.3, 0.9]), np.array([-0.8, 1.85, -0.3])  # of a camera that sees the light
     command = [sys.executable, "-m", "nlt.cli", "view", "--demo", "--port", "0", "--resolution", "384"]
     shots = []
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+    with ExitStack() as stack:
         process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         stack.callback(process.terminate)
         assert process.stdout
@@ -60,14 +60,12 @@ def view(page: Page, path: Path) -> None:
         at = lambda point: ",".join(map(str, point))
         page.goto(f"{url}?initialCameraPosition={at(position)}&initialCameraLookAt={at(target)}")
         page.get_by_text("frames per second,").wait_for()
-
         page.get_by_role("alert").get_by_role("button").click()  # chromium renders in software
 
         def shoot() -> None:
             page.mouse.move(5, 5)
             page.wait_for_timeout(15_000)  # until it rests
-            page.screenshot(path=Path(folder) / "shot.png")
-            shots.append(Image.open(Path(folder) / "shot.png").convert("RGB"))
+            shots.append(np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")))
 
         def choose(label: str, option: str) -> None:
             page.get_by_label(label, exact=True).first.click()
@@ -100,10 +98,7 @@ def view(page: Page, path: Path) -> None:
         split("1")
         choose("left", REFERENCE)
         shoot()
-    strip = Image.new("RGB", (shots[0].width, sum(shot.height for shot in shots)))
-    for k, shot in enumerate(shots):
-        strip.paste(shot, (0, k * shot.height))
-    strip.save(path, quality=85)
+    Image.fromarray(np.concatenate(shots)).save(path, quality=85)
 
 
 def main() -> None:

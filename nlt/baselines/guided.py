@@ -4,8 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from nlt.display import expose
-from nlt.models.module import Batch, join_channels
+from nlt.models.module import Batch, join_channels, log_exposed
 from nlt.models.nlt import NeuralLightTransport
 
 _LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
@@ -48,8 +47,7 @@ class GuidedOneSample(NeuralLightTransport):
 
     def gbuffer(self, batch: Batch) -> Tensor:
         """Return the G-buffer and the noisy radiance without lamps in view, divided by the albedo (B, 13, H, W)."""
-        noisy = expose(_reflected(batch), self._exposure(batch)).log1p()
-        return join_channels([super().gbuffer(batch), noisy])
+        return join_channels([super().gbuffer(batch), log_exposed(_reflected(batch), self._exposure(batch))])
 
     def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
         return super().to_radiance(batch | {"exposure": self._exposure(batch)}, channels)

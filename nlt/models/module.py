@@ -36,12 +36,12 @@ Features = Tensor | tuple[Tensor, list[SparseMap]]
 
 
 def log_exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
-    """Return log(1 + exposure * radiance) of a radiance (B, ...) and an exposure (B,).
+    """Return log(1 + exposure * radiance): radiance (B, ...) and exposure (B,), or (B, 3, H, W) and (B, 3).
 
     Network inputs of high dynamic range are compressed this way: a lamp or a firefly is orders of magnitude brighter
     than the rest, and its linear value would swamp every feature it is mixed with.
     """
-    return torch.log1p(radiance * exposure.view(-1, *[1] * (radiance.ndim - 1)))
+    return torch.log1p(radiance * exposure.view(*exposure.shape, *[1] * (radiance.ndim - exposure.ndim)))
 
 
 def warm_up_and_cosine(step: int, steps: int) -> float:
@@ -303,8 +303,9 @@ class RenderingModule(Method, L.LightningModule):
         path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
-        saved = checkpoint["architecture"]
-        different = [name for name in self.architecture if name in saved and saved[name] != self.hparams[name]]
+        # An option that is younger than the checkpoint was off in its training.
+        saved = dict.fromkeys(self.architecture, False) | checkpoint["architecture"]
+        different = [name for name in self.architecture if saved[name] != self.hparams[name]]
         if different:
             raise UserError(
                 f"{path or 'given'}: checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, "

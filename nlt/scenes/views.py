@@ -38,6 +38,7 @@ class Views:
         # Shapes are inside out if most rays from the camera volume hit their backs.
         rng, description = np.random.default_rng(0), scene.description
         (low, high), room = description.camera, description.room
+        # A stage that is seen from outside does not surround the camera.
         self._from_outside = room is not None and bool((low > room[1]).any() or (high < room[0]).any())
         with scene.in_state(rest_state(description, scene.experiment)):
             looks = [self.look(rng.uniform(*description.camera), self._sphere) for _ in range(_PROBES)]
@@ -78,8 +79,7 @@ class Views:
         image = camera.directions(np.stack([columns.ravel() * camera.width, rows.ravel() * camera.height], 1))
         distance, behind, shape = self.look(camera.position, np.concatenate([self._sphere, image]))
         back = behind ^ np.isin(shape, self._inverted)
-        around = 0 if self._from_outside else 1  # a stage that is seen from outside does not surround the camera
-        share = lambda mask: max(mask[:_RAYS].mean() * around, mask[_RAYS:].mean())
+        share = lambda mask: max(half.mean() for half in np.split(mask, 2)[self._from_outside :])
         return {"back": share(back), "near": (distance[_RAYS:] < _NEAR).mean(), "nothing": share(np.isinf(distance))}
 
     def look(self, position: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:

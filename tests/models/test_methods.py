@@ -20,6 +20,7 @@ from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.baselines.feature_projection import FeatureProjection
+from nlt.baselines.guided import GuidedOneSample
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.cli import main
 from nlt.config import read_configs
@@ -321,6 +322,16 @@ def test_checkpoint_of_another_method(tmp_path, checkpoints, wanted, options, sa
         with pytest.raises(UserError, match=message) as error:
             load()
         assert "\n" not in str(error.value)
+
+
+def test_checkpoint_older_than_an_option():
+    """The option was off in its training."""
+    checkpoint = {}
+    GuidedOneSample(**SIZE).on_save_checkpoint(checkpoint)
+    del checkpoint["architecture"]["relative"]
+    GuidedOneSample(**SIZE).on_load_checkpoint(checkpoint)
+    with pytest.raises(UserError, match="checkpoint has relative=False, this model relative=True"):
+        GuidedOneSample(relative=True, **SIZE).on_load_checkpoint(checkpoint)
 
 
 @pytest.mark.parametrize("config", ["nlt_photons", "denoising_1_4"])
