@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from torch.utils.data import DataLoader, Sampler
 
@@ -16,7 +17,7 @@ from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath
 from nlt.data.sample import BUFFERS
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import check_dataset, points_crc, points_name, read_points
+from nlt.data.store import Points, check_dataset, points_name, read_points
 from nlt.errors import UserError
 
 _AHEAD = 2  # batches that each reading thread may be ahead
@@ -92,7 +93,7 @@ class LightTransportDataModule(L.LightningDataModule):
         self.stored = dataset.without_train() if online else dataset
         self.gbuffer = False  # whether samples have the whole G-buffer, whatever the method reads
         self.directory: AnyPath | None = None
-        self.point_checksums: list[int] = []
+        self.points: list[Points] = []
 
     def next_pass(self) -> int:
         """Return the index of the next pass over the online samples and count it."""
@@ -100,15 +101,17 @@ class LightTransportDataModule(L.LightningDataModule):
         return self.passes - 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Return a checkpoint's state: CRCs of the points that embeddings belong to, and online passes begun so far."""
-        return {"point_checksums": self.point_checksums, "passes": self.passes}
+        """Return a checkpoint's state: each scene's points, to which embeddings belong, and online passes so far."""
+        points = [{name: torch.from_numpy(array) for name, array in each.items()} for each in self.points]
+        return {"points": points, "passes": self.passes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a checkpoint's state; raise UserError if its embeddings belong to other points than the dataset's."""
         self.passes = state_dict.get("passes", 0)
-        theirs, ours = state_dict.get("point_checksums"), self.point_checksums
+        pairs = zip(state_dict.get("points", ()), self.points, strict=False)
+        same = all(np.array_equal(theirs["position"], ours["position"]) for theirs, ours in pairs)
         method = getattr(self.trainer, "lightning_module", None)
-        if getattr(method, "has_point_embeddings", False) and theirs and ours and theirs != ours:
+        if getattr(method, "has_point_embeddings", False) and not same:
             raise UserError(
                 f"{self.directory}: its points differ from those of the checkpoint's embeddings, for example because "
                 "another NLT_VARIANT rendered it; give --data.root with the checkpoint's own dataset, or train again"
@@ -120,7 +123,7 @@ class LightTransportDataModule(L.LightningDataModule):
             directory = self.stored.directory(self.root)
             check_dataset(directory, self.stored)
             self.directory = directory
-            self.point_checksums = [points_crc(read_points(directory / points_name(k))) for k in range(self.num_scenes)]
+            self.points = [read_points(directory / points_name(k)) for k in range(self.num_scenes)]
 
     def split(self, name: str) -> LightTransportDataset:
         """Return the dataset of a split with the fields that the trainer's method needs, or all without a trainer."""

@@ -88,11 +88,6 @@ def read_points(path: AnyPath) -> Points:
     return ShardReader().read(path, 0, POINT_FIELDS)
 
 
-def points_crc(points: Points) -> int:
-    """Return a checksum of the points and their order, to which learned embeddings belong."""
-    return zlib.crc32(points["position"].tobytes())
-
-
 def points_name(scene: int) -> str:
     """Return the name of the file with a scene's points, relative to the dataset's directory."""
     return f"points-{scene:03d}.safetensors"

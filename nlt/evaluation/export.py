@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -15,12 +16,14 @@ from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.files import write_bytes
 from nlt.data.sample import BATCH_FIELDS, FIELDS
 from nlt.data.spec import DatasetSpec
+from nlt.data.store import Points
 from nlt.errors import UserError
 from nlt.models.factory import build, load_method, read_checkpoint
 from nlt.models.method import Batch
 from nlt.models.module import RenderingModule
 
 SAFETENSORS = ".safetensors"
+_POINTS = "points."  # begins the names of the points' tensors: points.SCENE.FIELD
 
 
 class _Frame(nn.Module):
@@ -63,24 +66,26 @@ def export(checkpoint: str, output: str, resolution: int, photons: int) -> None:
     write_bytes(Path(output), file.getvalue())
 
 
-def save_trained(method: RenderingModule, spec: DatasetSpec, point_checksums: list[int], output: str) -> None:
-    """Write a method, its dataset's spec and its points' checksums as safetensors for `load_trained`."""
+def save_trained(method: RenderingModule, spec: DatasetSpec, points: Sequence[Points], output: str) -> None:
+    """Write a method, its dataset's spec and, if it has embeddings of them, each scene's points for `load_trained`."""
     settings = {key: value for key, value in method.hparams.items() if not key.startswith("_")}
     metadata = {
         "method": method.class_path(),
         "init_args": settings,
         "dataset": dataclasses.asdict(spec),
-        "point_checksums": point_checksums,
     }
-    weights = {name: tensor.contiguous() for name, tensor in method.state_dict().items()}
-    write_bytes(Path(output), save(weights, {"nlt": json.dumps(metadata)}))
+    tensors = {name: tensor.contiguous() for name, tensor in method.state_dict().items()}
+    if method.has_point_embeddings:
+        named = {f"{_POINTS}{k}.{name}": array for k, each in enumerate(points) for name, array in each.items()}
+        tensors |= {name: torch.from_numpy(array) for name, array in named.items()}
+    write_bytes(Path(output), save(tensors, {"nlt": json.dumps(metadata)}))
 
 
-def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
+def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[Points]]:
     """Load a trained method from a checkpoint in its run's directory or from safetensors.
 
-    Returns the method, the spec of the dataset that it was trained on, and the `points_crc` of each scene, which is
-    empty for files from before checksums were stored.
+    Returns the method, the spec of the dataset that it was trained on, and each scene's points, to which embeddings
+    belong. Safetensors of methods without embeddings have no points.
 
     Raises:
         UserError: the file cannot be read or holds no trained method.
@@ -95,16 +100,20 @@ def load_trained(path: str) -> tuple[RenderingModule, DatasetSpec, list[int]]:
             spec = DatasetSpec(**read_configs([str(config)])["data"]["dataset"])
         except (LookupError, TypeError):
             raise UserError(f"CKPT: {path}: {config} names no dataset; keep the checkpoint in its run") from None
-        data = read_checkpoint(path).get(LightTransportDataModule.__qualname__, {})
-        return method, spec, data.get("point_checksums", [])
+        stored = read_checkpoint(path).get(LightTransportDataModule.__qualname__, {}).get("points", [])
+        return method, spec, [{name: tensor.numpy() for name, tensor in each.items()} for each in stored]
     try:
         with safe_open(path, "pt") as file:
             metadata = json.loads(file.metadata()["nlt"])
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         loaded = build({"model": {"class_path": metadata["method"], "init_args": metadata["init_args"]}}, "CKPT")
         assert isinstance(loaded, RenderingModule)
-        loaded.load_state_dict(weights)
-        return loaded, DatasetSpec(**metadata["dataset"]), metadata.get("point_checksums", [])
+        points: list[Points] = [{} for _ in metadata["dataset"]["scenes"]]
+        for name in [name for name in tensors if name.startswith(_POINTS)]:
+            scene, field = name.removeprefix(_POINTS).split(".")
+            points[int(scene)][field] = tensors.pop(name).numpy()
+        loaded.load_state_dict(tensors)
+        return loaded, DatasetSpec(**metadata["dataset"]), points
     except OSError as error:
         raise UserError(f"CKPT: {path}: cannot be read: {error.strerror or error}") from None
     except (SafetensorError, LookupError, TypeError, UserError, ValueError, RuntimeError, AssertionError):

@@ -26,7 +26,7 @@ from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
 from nlt.data.sample import BUFFERS, TRACED
 from nlt.data.spec import DatasetSpec
-from nlt.data.store import Points, points_crc, points_name, read_points
+from nlt.data.store import Points
 from nlt.display import display
 from nlt.errors import UserError
 from nlt.evaluation.export import load_trained
@@ -51,7 +51,6 @@ DEMO = {
 }
 DEMO_SCENE = "living_room"
 MANIFEST = "render.json"
-_DATASETS = "datasets"  # folder in which stored datasets are looked up
 _MODEL, _TRACED = 0, 1  # seeds of photons and of path tracing
 _WARM, _TIMED = 2, 5  # frames; the warm-up compiles kernels
 _FEW, _MANY = 1, 8  # samples per pixel whose times give the cost of one sample
@@ -63,8 +62,9 @@ class ModelRenderer:
     """Renders frames with a trained method; what does not depend on the camera is reused until the state changes.
 
     `scene` is the scene's index in `spec`. Photons have the same seed in all states, so that they follow a moving
-    light without flicker. Several methods may share the `render` of one scene. `seconds` holds the seconds of each
-    stage since it was last cleared. `steady`, if set, blends each frame with those before it.
+    light without flicker. `points` are those of training, to which embeddings belong; without them, they are sampled.
+    Several methods may share the `render` of one scene. `seconds` holds the seconds of each stage since it was last
+    cleared. `steady`, if set, blends each frame with those before it.
     """
 
     steady: Steady | None = None
@@ -75,6 +75,7 @@ class ModelRenderer:
         spec: DatasetSpec,
         scene: int,
         device: torch.device,
+        points: Points | None = None,
         render: SampleRenderer | None = None,
     ) -> None:
         self.spec, self.scene, self.device = spec, scene, device
@@ -86,16 +87,12 @@ class ModelRenderer:
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
         self._state_fields = {name for name in method.fields if name.startswith("photon_")}
-        self.points: Points = self._load_points() if any(name.startswith("point_") for name in method.fields) else {}
-        if self.points:
+        clouds: dict[int, Points] = {}
+        if any(name.startswith("point_") for name in method.fields):
+            clouds[scene] = points or self.render.points()
             self._state_fields |= {"translation", "present"}
         fields = {*method.fields} - {"view_direction"}  # `batch` computes it, at any resolution
-        self._tensors = SampleTensors(spec, {scene: self.points} if self.points else {}, fields)
-
-    def _load_points(self) -> Points:
-        """Return the points of training, in the order of their embeddings; from the stored dataset if there is one."""
-        stored = self.spec.directory(_DATASETS) / points_name(self.scene)
-        return read_points(stored) if stored.exists() else self.render.points()
+        self._tensors = SampleTensors(spec, clouds, fields)
 
     def batch(self, state: SceneState, camera: Camera, number: int = 0) -> Batch:
         """Return the fields of a frame that the method reads, as a batch of one; noise differs by its number."""
@@ -263,11 +260,11 @@ def render(
 
 
 class Loaded(NamedTuple):
-    """A trained method, the checksums of its points, and the scene that it will draw: number `scene` in `spec`."""
+    """A trained method, and the scene that it will draw: number `scene` in `spec`, with the points of training."""
 
     checkpoint: str
     method: RenderingModule
-    checksums: list[int]
+    points: Points | None
     spec: DatasetSpec
     scene: int
 
@@ -280,32 +277,31 @@ def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int 
     """
     loaded = {}
     for name, checkpoint in checkpoints.items():
-        method, spec, checksums = load_trained(checkpoint)
+        method, spec, points = load_trained(checkpoint)
         scene = scene or spec.scenes[0]
         spec, index = with_scene(method, spec, scene, checkpoint)
         spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
-        loaded[name or type(method).__name__] = Loaded(checkpoint, method, checksums, spec, index)
+        own = None
+        if method.has_point_embeddings:
+            if not (points and points[index]):
+                raise UserError(
+                    f"CKPT: {checkpoint}: has embeddings of points, but not the points, which an older nlt left out; "
+                    "train again"
+                )
+            own = points[index]
+        loaded[name or type(method).__name__] = Loaded(checkpoint, method, own, spec, index)
     return loaded
 
 
 def open_models(loaded: Mapping[str, Loaded]) -> dict[str, ModelRenderer]:
-    """Return the renderers of loaded methods, on the default device and by their fast paths; they share a scene.
-
-    Raises:
-        UserError: a method has embeddings of other points than those of its scene here.
-    """
+    """Return the renderers of loaded methods, on the default device and by their fast paths; they share a scene."""
     models: dict[str, ModelRenderer] = {}
     render, device = None, default_device()
-    for name, (checkpoint, method, checksums, spec, scene) in loaded.items():
+    for name, (_, method, points, spec, scene) in loaded.items():
         shared = render if render and (render.spec, render.index) == (spec, scene) else None
         fast = accelerate(method, Policy.for_device(device), device)
-        models[name] = model = ModelRenderer(fast, spec, scene, device, shared)
+        models[name] = model = ModelRenderer(fast, spec, scene, device, points, shared)
         render = model.render
-        if method.has_point_embeddings and checksums and points_crc(model.points) != checksums[scene]:
-            raise UserError(
-                f"CKPT: {checkpoint}: its embeddings are of other points than those here (is NLT_VARIANT different?); "
-                f"put the dataset that it was trained on at {spec.directory(_DATASETS)}"
-            )
     return models
 
 
