@@ -12,6 +12,21 @@ once() {
 publish() {
     once nlt compare --scale "$scale" --workers "${WORKERS:-2}" "$@"
 }
+room() {
+    once nlt compare --data real_living_room_moving_lights --workers "${WORKERS:-2}" "$@"
+}
+table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
+    oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
+front="cnn feature_projection nlt nlt_photons guided_1spp guided_1spp_relative
+    oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
+# shellcheck disable=SC2086  # lists of methods
+if [ "$scale" = small ]; then
+    room --config table2_real_demodulated --methods $table2 --out results/real_living_room
+    room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
+    room --config front --methods $front --out results/front_living_room
+    room --config front --scale medium --methods $front guided_1spp@other_rooms guided_1spp_relative@other_rooms \
+        --out results/front_living_room_256
+fi
 for comparison in table2_real table1_real ablation table2_builtin table1_builtin; do
     publish --config "$comparison" --seeds 3
 done
