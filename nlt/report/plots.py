@@ -27,7 +27,7 @@ plt.rcParams.update({
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 PICTURE = ("webp",)  # the kind of file for a figure made of images; its lossy pixels are a sixth of a PNG's size
-_INCH, _TITLE = 1.1, 0.35  # inches: an image of a grid, and the space above it
+_INCH, _LINE = 1.1, 0.12  # inches: an image of a grid, and a line of its title
 
 
 def style(number: int) -> dict[str, Any]:
@@ -76,13 +76,15 @@ def add_legend(
 
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
     """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
-    size = (_INCH * len(columns), _INCH * rows + _TITLE + bottom)
+    titles = [name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(") for name in columns]
+    top = _LINE * (2 + max(title.count("\n") for title in titles))
+    size = (_INCH * len(columns), _INCH * rows + top + bottom)
     figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, name in zip(axes[0], columns, strict=True):
-        axis.set_title(name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n("), fontsize=7)
-    figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - _TITLE / size[1], 0.02, 0.02)
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=7)
+    figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - top / size[1], 0.02, 0.02)
     return figure, axes
 
 
