@@ -44,6 +44,7 @@ def test_copies_are_as_they_stand():
     copied = "".join(page.read_text() for page in script["PAGES"])
     for source in (
         "results/real_living_room_256/table.md",
+        "results/real_living_room/table.md",
         "nlt/data/sample.py FIELDS",
         "scripts/paper_scale.py",
         "results/recipe/table.md",

@@ -216,7 +216,9 @@ def test_recipe_of_a_metric(monkeypatch):
 
 
 def test_provenance():
-    """The manifest of the README's table says where it comes from."""
-    record = json.loads((PROJECT / "results/real_living_room_256/manifest.json").read_text())
-    assert record["command"].startswith("nlt compare") and len(record["commit"]) == 40
-    assert record["n_test"] >= 32 and record["seeds"][0] == 0 and record["device"] and record["versions"]["torch"]
+    """The manifests of Table 2, in the README and at 64x64, say where it comes from."""
+    for name, views in (("real_living_room_256", 32), ("real_living_room", 64)):
+        record = json.loads((PROJECT / f"results/{name}/manifest.json").read_text())
+        assert record["command"].startswith("nlt compare") and len(record["commit"]) == 40
+        assert record["n_test"] >= views and record["seeds"][0] == 0
+        assert record["device"] and record["versions"]["torch"]

@@ -108,10 +108,11 @@ class LightTransportDataModule(L.LightningDataModule):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a checkpoint's state; raise UserError if its embeddings belong to other points than the dataset's."""
         self.passes = state_dict.get("passes", 0)
-        pairs = zip(state_dict.get("points", ()), self.points, strict=False)
-        same = all(np.array_equal(theirs["position"], ours["position"]) for theirs, ours in pairs)
+        theirs, ours = state_dict.get("points"), self.points
+        positions = lambda points: np.concatenate([each["position"] for each in points])
         method = getattr(self.trainer, "lightning_module", None)
-        if getattr(method, "has_point_embeddings", False) and not same:
+        embeds = getattr(method, "has_point_embeddings", False)
+        if embeds and theirs and ours and not np.array_equal(positions(theirs), positions(ours)):
             raise UserError(
                 f"{self.directory}: its points differ from those of the checkpoint's embeddings, for example because "
                 "another NLT_VARIANT rendered it; give --data.root with the checkpoint's own dataset, or train again"

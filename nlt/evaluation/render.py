@@ -281,14 +281,12 @@ def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int 
         scene = scene or spec.scenes[0]
         spec, index = with_scene(method, spec, scene, checkpoint)
         spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
-        own = None
-        if method.has_point_embeddings:
-            if not (points and points[index]):
-                raise UserError(
-                    f"CKPT: {checkpoint}: has embeddings of points, but not the points, which an older nlt left out; "
-                    "train again"
-                )
-            own = points[index]
+        own = points[index] if method.has_point_embeddings and points else None
+        if method.has_point_embeddings and not own:
+            raise UserError(
+                f"CKPT: {checkpoint}: has embeddings of points, but not the points, which an older nlt left out; "
+                "train again"
+            )
         loaded[name or type(method).__name__] = Loaded(checkpoint, method, own, spec, index)
     return loaded
 
