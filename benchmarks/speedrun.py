@@ -6,7 +6,7 @@
 The room, the test views and their references are fixed: by default those of data/demo at scale/recipe. The lines are
 the FID and MSSIM of Open Image Denoise at 1 spp, and half the MSE of the first record, which must be the CNN at that
 scale. The clock runs while the training set is rendered and while the method is trained, on all cores; it stands still
-while the result is judged. Each run adds a record to records.csv and writes table.md.
+while the result is judged. Each run adds a record to records.csv and writes records.md.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def main() -> None:
     lines = {"fid": known["fid"], "mssim": known["mssim"], "mse": (records or [record])[0]["mse"] / 2}
     records.append(record | {"lines": passed(record, lines)})
     write_rows(records_file, records)
-    write_bytes(out / "table.md", table(records, lines).encode())
+    write_bytes(out / "records.md", table(records, lines).encode())
     write_manifest(out, provenance | surroundings(device) | {"lines": lines, "torch_threads": torch.get_num_threads()})
     print(table(records, lines))
 

@@ -25,8 +25,7 @@ if [ "$scale" = small ]; then
     room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
     room --config table2_real --scale medium --out results/real_living_room_256_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
-    room --config windows --scale medium --out results/windows \
-        --methods cnn cnn@windows_128 cnn@whole_images photons_only photons_only@windows_128 photons_only@whole_images
+    room --config windows --scale medium --out results/windows
     room --config front --methods $front --out results/front_living_room
     room --config front --scale medium --methods $front guided_1spp@other_rooms guided_1spp_relative@other_rooms \
         --out results/front_living_room_256

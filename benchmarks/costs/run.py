@@ -30,10 +30,10 @@ from nlt.config import Settings, parse, read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
-from nlt.data.generate import fill, plan
+from nlt.data.generate import fill, plan, timed_spp
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, load_spec
-from nlt.data.stats import laps, timed_spp
+from nlt.data.stats import laps
 from nlt.data.store import missing_files, write_manifest, write_shard
 from nlt.errors import UserError
 from nlt.evaluation.clock import LEAST_FRAMES, Clock, summary

@@ -28,6 +28,7 @@ from nlt.rendering.variant import choose_variant
 SAMPLES_PER_JOB = 1024
 # Number of pilot views per scene, and samples per pixel of each half of a pilot reference.
 PILOT_VIEWS, PILOT_SPP = 4, 32
+TIMED_SPP = 8  # most samples per pixel of a reference that is only timed
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
     if isinstance(engine, Local):  # other machines may be faster or slower
         try:
             mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))
-            train, evaluated = Process(_measure, replace(spec, train=1, val=0, test=1, reference_spp=mean)).result()
+            train, evaluated = Process(_measure, replace(spec, train=1, val=0, test=1), mean).result()
         except Died as error:
             raise UserError(f"the renderer crashed in a trial run ({error})") from None
         seconds = (samples["train"] * train + (samples["val"] + samples["test"]) * evaluated) / engine.workers
@@ -227,7 +228,18 @@ def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Call
     write_shard(path, samples)
 
 
-def _measure(spec: DatasetSpec) -> list[float]:
-    """Return the seconds of a training sample and of a test sample, with one thread after a warm-up."""
+def timed_spp(spec: DatasetSpec) -> int:
+    """Return the samples per pixel at which a reference is timed; its seconds are extrapolated linearly."""
+    return min(spec.reference_spp, TIMED_SPP)
+
+
+def _measure(spec: DatasetSpec, reference_spp: float) -> tuple[float, float]:
+    """Return the seconds of a training sample and of a test sample, with one thread after a warm-up.
+
+    References are timed with few samples per pixel, because many would take minutes, and extrapolated.
+    """
+    spec.reference_spp = timed_spp(spec)  # this process has its own spec
     render = SampleRenderer(spec, 0, threads=1)
-    return [timeit.repeat(partial(render.sample, split, 0), number=1, repeat=2)[-1] for split in ("train", "test")]
+    seconds = lambda *sample: timeit.repeat(partial(render.sample, *sample), number=1, repeat=2)[-1]
+    reference = seconds("test", 0, ("reference_a", "reference_b")) * (reference_spp / spec.reference_spp - 1)
+    return seconds("train", 0), seconds("test", 0) + reference

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from nlt.config import read_configs
 from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
-from nlt.data.generate import SAMPLES_PER_JOB
+from nlt.data.generate import SAMPLES_PER_JOB, TIMED_SPP, timed_spp
 from nlt.data.render import SampleRenderer
 from nlt.data.sample import BUFFERS, FIELDS
 from nlt.data.spec import DatasetSpec
@@ -32,7 +32,6 @@ STAGES = {
     "storing": (),
 }
 _WARM_UP, _SAMPLES = 2, 4
-_MOST_SPP = 8  # maximum samples per pixel of a timed reference
 
 
 def stats(place: str, workers: int | None = None) -> str:
@@ -60,7 +59,7 @@ def stats(place: str, workers: int | None = None) -> str:
             lines.append(f"{name if len(fields) == 1 else '  ' + name:18}{sizes}{timed if len(fields) == 1 else ''}")
     lines += [
         f"Seconds are measured in {workers} concurrent processes, each with {_SAMPLES} samples per scene after "
-        f"{_WARM_UP} for warm-up; references are timed at up to {_MOST_SPP} spp and extrapolated linearly. "
+        f"{_WARM_UP} for warm-up; references are timed at up to {TIMED_SPP} spp and extrapolated linearly. "
         f"Totals are extrapolated from these samples.",
         _cost("this dataset", spec, ours, workers),
         _cost("the paper's", paper, theirs, workers),
@@ -113,11 +112,6 @@ def _time_samples(spec: DatasetSpec, scene: int, threads: int, launched: float) 
     start = time.time() - launched - sum(seconds.values()) * len(frames)
     seconds["reference"] *= 2 * spec.reference_spp / timed_spp(spec)
     return seconds | {"start": start}
-
-
-def timed_spp(spec: DatasetSpec) -> int:
-    """Return the samples per pixel at which the reference is timed; its seconds are extrapolated linearly."""
-    return min(spec.reference_spp, _MOST_SPP)
 
 
 def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str, float]:

@@ -155,8 +155,10 @@ def draw_learning_curves(results: Results) -> None:
     handles: dict[str, Any] = {}
     for axis in axes.flat:
         handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-    height = 0.25 * -(-len(handles) // (2 * columns)) / figure.get_figheight()
-    figure.legend(handles.values(), handles, loc="lower center", ncols=2 * columns)
+    longest = 0.5 + 0.07 * max(map(len, handles))  # inches of an entry
+    side_by_side = max(1, min(2 * columns, int(figure.get_figwidth() / longest)))
+    height = 0.25 * -(-len(handles) // side_by_side) / figure.get_figheight()
+    figure.legend(handles.values(), handles, loc="lower center", ncols=side_by_side)
     figure.tight_layout(rect=(0, height, 1, 1))
     plots.save(figure, results.directory, "learning_curves")
 

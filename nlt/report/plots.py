@@ -1,5 +1,6 @@
 """What all figures share: style, logarithmic time axes, Pareto fronts, legends, grids of images, files."""
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +29,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 PICTURE = ("webp",)  # the kind of file for a figure made of images; its lossy pixels are a sixth of a PNG's size
 _INCH, _LINE = 1.1, 0.12  # inches: an image of a grid, and a line of its title
+_TITLE = 20  # characters of such a line
 
 
 def style(number: int) -> dict[str, Any]:
@@ -76,7 +78,8 @@ def add_legend(
 
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
     """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
-    titles = [name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(") for name in columns]
+    broken = (name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(") for name in columns)
+    titles = ["\n".join(textwrap.fill(line, _TITLE) for line in title.split("\n")) for title in broken]
     top = _LINE * (2 + max(title.count("\n") for title in titles))
     size = (_INCH * len(columns), _INCH * rows + top + bottom)
     figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)

@@ -52,7 +52,7 @@ def test_two_runs(tiny, tmp_path, monkeypatch, one_thread):
     for row in (first, second):
         assert row["minutes"] == pytest.approx(row["render_min"] + row["train_min"]) and row["train_min"] > 0
     assert "line 3" not in first["lines"] and first["mse"] > 0 and first["mse"] != second["mse"]
-    assert f"MSE below {first['mse'] / 2:.4g}" in (tmp_path / "results/speedrun/table.md").read_text()
+    assert f"MSE below {first['mse'] / 2:.4g}" in (tmp_path / "results/speedrun/records.md").read_text()
     monkeypatch.setattr(sys, "argv", ["speedrun.py", "cnn", *fixed, "--what", "x", "--set", "data.dataset.test=2"])
     with pytest.raises(UserError, match="changes the test views"):
         runpy.run_path(SCRIPT)["main"]()
