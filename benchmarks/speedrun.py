@@ -60,7 +60,7 @@ def table(records: list[dict[str, Any]], lines: dict[str, float]) -> str:
     for number, (name, label) in enumerate(_LINES.items(), 1):
         through = [record for record in records if f"line {number}" in record["lines"]]
         best = min(through, key=lambda record: record["minutes"], default=None)
-        cells = [f"{best['minutes']:.1f}", best["what"]] if best else ["–", "not passed"]
+        cells = [f"{best['minutes']:.1f}", f"{best['method']}: {best['what']}"] if best else ["–", "not passed"]
         rows.append([number, f"{label} {'above' if name == 'mssim' else 'below'} {lines[name]:.4g}", *cells])
     text += grid(["line", "goal", "minutes", "record"], rows, numbers=False)
     headings = ["date", "commit", "method", "what changed", "rendering (min)", "training (min)", "total (min)",

@@ -33,7 +33,7 @@ def test_the_table_names_the_fastest_of_each_line():
         for what, minutes, lines in [("slow", 9.0, "line 1, line 2"), ("quick", 3.0, "line 1"), ("lost", 1.0, "none")]
     ]
     text = runpy.run_path(SCRIPT)["table"](records, LINES)
-    assert "| 1 | FID below 60 | 3.0 | quick |" in text and "| 2 | MSSIM above 0.8 | 9.0 | slow |" in text
+    assert "| 1 | FID below 60 | 3.0 | cnn: quick |" in text and "| 2 | MSSIM above 0.8 | 9.0 | cnn: slow |" in text
     assert "| 3 | MSE below 0.002 | – | not passed |" in text
     assert "| 2026-01-01 | abcdef1 | cnn | quick | 1.00 | 2.00 | 3.00 | 50.0 | 0.5000 | 0.10000 | line 1 |" in text
 
