@@ -23,7 +23,7 @@ from nlt.data.sample import BUFFERS
 from nlt.display import display
 from nlt.errors import UserError
 from nlt.models.clouds import CloudMethod
-from nlt.models.factory import method_class, read_checkpoint, without_unused
+from nlt.models.factory import load_method, method_class, read_checkpoint, without_unused
 from nlt.models.image_grid import ImageGrid
 from nlt.models.module import RenderingModule
 from nlt.models.policy import Policy, default_device
@@ -42,7 +42,7 @@ _NOISE = (
 # Names of checkpoints that Lightning finds by itself.
 _LIGHTNING_CHECKPOINTS = ("best", "last", "hpc")
 # A setting as `key=value`, without the dashes of Lightning's `--key=value`.
-_SETTING = re.compile(r"(data|model|trainer|seed_everything|ckpt_path)\b[\w.+]*=")
+_SETTING = re.compile(r"(data|model|trainer|seed_everything|ckpt_path|start_from)\b[\w.+]*=")
 
 
 class Checkpoints(ModelCheckpoint):
@@ -102,6 +102,15 @@ class Predictions(BasePredictionWriter):
 class NLTCLI(LightningCLI):
     """LightningCLI in subclass mode, for one DataModule and any method."""
 
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add `start_from`, which `nlt fit` reads; the other commands accept it because a run's config contains it."""
+        parser.add_argument(
+            "--start_from",
+            type=str | None,
+            default=None,
+            help="a checkpoint of the same method, trained in any rooms, whose weights `fit` starts from",
+        )
+
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         if subcommand == "predict":
@@ -134,6 +143,8 @@ class NLTCLI(LightningCLI):
         """Instantiate the classes and report errors of the model or trainer as user errors."""
         try:
             super().instantiate_classes()
+            if self.subcommand == "fit" and self.config.fit.start_from:
+                self._start_from(self.config.fit.start_from)
             if self.subcommand == "predict" and self.config.predict.exr:
                 self.datamodule.gbuffer = True
                 trainer: Any = self.trainer
@@ -142,6 +153,21 @@ class NLTCLI(LightningCLI):
                         callback.exr = True
         except (ValueError, MisconfigurationException) as error:
             raise UserError(_one_line(str(error))) from None
+
+    def _start_from(self, checkpoint: str) -> None:
+        """Copy the weights of a checkpoint; with `ckpt_path`, Lightning overrides them by those of the resumed run.
+
+        Raises:
+            UserError: it is not a checkpoint, of another method or size, or of one with embeddings.
+        """
+        if self.model.has_point_embeddings:
+            raise UserError(
+                f"--start_from: {checkpoint}: the method has embeddings of the points of its training scenes; use a "
+                "method without them, such as photons_only, or resume with --ckpt_path"
+            )
+        weights = load_method(checkpoint, "--start_from").state_dict()
+        self.model.check_checkpoint(read_checkpoint(checkpoint), checkpoint)
+        self.model.load_state_dict(weights)
 
 
 def quiet() -> None:

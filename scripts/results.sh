@@ -29,6 +29,7 @@ if [ "$scale" = small ]; then
     room --config front --methods $front --out results/front_living_room
     room --config front --scale medium --methods $front guided_1spp@other_rooms guided_1spp_relative@other_rooms \
         --out results/front_living_room_256
+    room --config other_rooms --scale medium --out results/other_rooms
 fi
 for comparison in table2_real table1_real ablation table2_builtin table1_builtin; do
     publish --config "$comparison" --seeds 3

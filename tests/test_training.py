@@ -143,6 +143,35 @@ def test_embeddings_of_other_points_are_refused(tiny, checkpoint, tmp_path, capf
         assert "its points differ from those of the checkpoint's embeddings" in error and str(directory) in error
 
 
+def test_training_starts_from_weights(tiny, checkpoint, tmp_path):
+    """With a learning rate of zero, the weights remain the checkpoint's, although the seed is another."""
+    options = [f"--start_from={checkpoint}", "--model.init_args.learning_rate=0", "--seed_everything=7"]
+    trainer = run_lightning(tiny.command("fit", "cnn", *options)).trainer
+    assert trainer.global_step == 4
+    weights = torch.load(checkpoint, weights_only=True)["state_dict"]
+    assert content(dict(trainer.model.state_dict())) == content(weights)
+    # A resumed run has its own weights, not those that it started from.
+    last, other = trainer.checkpoint_callback.best_model_path, run_lightning(tiny.command("fit", "cnn")).trainer
+    other_checkpoint = other.checkpoint_callback.best_model_path
+    again = [f"--start_from={other_checkpoint}", f"--ckpt_path={last}", "--model.init_args.learning_rate=0"]
+    trainer = run_lightning(tiny.command("fit", "cnn", *again)).trainer
+    assert content(dict(trainer.model.state_dict())) == content(weights)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("nlt", [], "the method has embeddings of the points of its training scenes"),
+        ("denoising_1_1", [], "checkpoint is of CNN, not SparseDenoising"),
+        ("cnn", ["--model.init_args.width=4"], "checkpoint has width=2, this model width=4"),
+    ],
+)
+def test_training_cannot_start_from_other_weights(tiny, checkpoint, capfd, method, options, message):
+    assert main(tiny.command("fit", method, f"--start_from={checkpoint}", *options)) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and str(checkpoint) in error and message in error
+
+
 def test_mixed_precision(tiny, tmp_path, monkeypatch):
     """Where the device has bfloat16, layers use it; the weights and Adam's state do not."""
     seen = {}

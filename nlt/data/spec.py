@@ -233,6 +233,7 @@ class _Config(Settings):
     model: Any = None
     trainer: Any = None
     seed_everything: Any = None
+    start_from: Any = None
 
 
 def load_spec(files: list[str], settings: Collection[tuple[str, str]] = ()) -> tuple[DatasetSpec, AnyPath]:

@@ -50,7 +50,8 @@ class Comparison:
         spec, root: the dataset and the directory of datasets.
         files: the config files of each method, later ones overriding earlier ones. `variant` changes every trained
             method; METHOD@VARIANT applies a further config of configs/variant to a single method. A variant may also
-            name another dataset to train on, which shows how a method does in rooms that it has never seen.
+            name another dataset to train on, which shows how a method does in rooms that it has never seen, and the
+            variant whose weights the training starts from.
         train_images: every method is also trained on only the first N images of each scene, for each N.
     """
 
@@ -111,6 +112,14 @@ class Comparison:
         )  # fmt: skip
         for method in found.trained:
             check_configs([str(path) for path in files[method]])
+            start = found.starts.get(method)
+            if start and (start not in found.trained or start in found.starts):
+                known = [name for name in found.trained if name not in found.starts]
+                place = f"{files[method][-1]}: start_from"
+                raise UserError(
+                    f"{place}: {start} must be a method of the comparison that starts from random weights; "
+                    f"known are {', '.join(known)}"
+                )
             elsewhere = found.training_specs[method] != spec
             if elsewhere and build(found.configs[method], files[method][1]).has_point_embeddings:
                 raise UserError(
@@ -144,6 +153,12 @@ class Comparison:
     def training_specs(self) -> dict[str, DatasetSpec]:
         """The dataset that each trained method is trained on."""
         return {method: load_spec([str(path) for path in self.files[method]])[0] for method in self.trained}
+
+    @cached_property
+    def starts(self) -> dict[str, str]:
+        """The methods that start from the weights of METHOD@VARIANT, where `start_from` in their config is VARIANT."""
+        chosen = {method: self.configs[method].get("start_from") for method in self.trained}
+        return {method: f"{method.partition('@')[0]}@{variant}" for method, variant in chosen.items() if variant}
 
     def runs(self, method: str) -> Path:
         """Return the directory of a method's trainings."""

@@ -36,6 +36,7 @@ class Training:
 
     The name of its directory `run` has a hash of all that determines the outcome, so a method is trained again only
     when that changes. The directory holds checkpoints, log, progress and, after the end, the outcome. `config` is JSON.
+    `start` is the training whose weights this one starts from.
     """
 
     method: str
@@ -43,6 +44,7 @@ class Training:
     run: Path
     config: str
     train_images: int | None = None
+    start: Training | None = None
 
     @classmethod
     def of(
@@ -58,6 +60,10 @@ class Training:
         config = merge(comparison.configs[method], changes or {})
         if train_images:
             config = merge(config, {"data": {"train_images": train_images}})
+        start = comparison.starts.get(method)
+        start_training = Training.of(comparison, start, seed, comparison.runs(start)) if start else None
+        if start_training:  # part of the directory's hash
+            config = merge(config, {"start_from": start_training.run.name})
         # A method that was trained on another device, in that device's precision, is not trained again on this one.
         choices = ("auto", "32", "bf16") if comparison.precision == "auto" else (comparison.precision,)
         precisions = dict.fromkeys(Policy.for_device(default_device(), name).precision for name in choices)
@@ -66,7 +72,7 @@ class Training:
         # The precision is fixed here, because the machine that trains might choose another one than the hash's.
         config = merge({"trainer": {"precision": precision}}, config)
         # An absolute path, because processes on other machines have other working directories.
-        return cls(method, seed, runs[precision].absolute(), json.dumps(config), train_images)
+        return cls(method, seed, runs[precision].absolute(), json.dumps(config), train_images, start_training)
 
     @property
     def name(self) -> str:
@@ -113,6 +119,8 @@ def train(
 ) -> dict[Training, str]:
     """Run the trainings that have not ended yet; return those that failed twice, with the reason.
 
+    Those that start from another training's weights run after all others.
+
     Each has its own process, because it may be killed for its memory and because Lightning keeps global state. On
     this machine they are forked from a process that has imported Lightning, which takes seconds. On its processor,
     several trainings run side by side and share the cores, which is faster than all cores for one after the other;
@@ -121,6 +129,18 @@ def train(
     Raises:
         UserError: a config or the dataset is wrong, or the disk is full.
     """
+    starts = [training.start for training in trainings if training.start]
+    first = list(dict.fromkeys([*(training for training in trainings if not training.start), *starts]))
+    failures = _train_side_by_side(first, scheduler, workers, slurm)
+    second = [training for training in trainings if training.start and training.start not in failures]
+    failures |= {t: f"{t.start.name}: {failures[t.start]}" for t in trainings if t.start and t.start in failures}
+    return failures | _train_side_by_side(second, scheduler, workers, slurm)
+
+
+def _train_side_by_side(
+    trainings: list[Training], scheduler: str, workers: int | None, slurm: Mapping[str, str]
+) -> dict[Training, str]:
+    """Run independent trainings as `train` does."""
     unfinished = [training for training in trainings if not training.outcome]
     failures: dict[Training, str] = {}
     if not unfinished:
@@ -170,7 +190,7 @@ def _train(training: Training, threads: int, tick: Callable[[int], None]) -> Non
 
 
 def _config_hash(config: dict[str, Any], seed: int, precision: str) -> str:
-    inputs = {key: config.get(key) for key in ("data", "model")} | {"seed": seed}
+    inputs = {key: config[key] for key in ("data", "model", "start_from") if key in config} | {"seed": seed}
     inputs["trainer"] = {"precision": precision, **config.get("trainer", {})}
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:8]
 
@@ -178,7 +198,12 @@ def _config_hash(config: dict[str, Any], seed: int, precision: str) -> str:
 def _fit(training: Training, progress: Progress) -> dict[str, Any]:
     """Run a job's training and return the facts about it."""
     resumed = newest_checkpoint(training.run) is not None
-    trainer = fit(training.run, json.loads(training.config), training.seed, [progress])
+    config = json.loads(training.config)
+    if start := training.start:
+        if diverged := (start.outcome or {}).get("diverged"):
+            raise DivergedError(f"{start.name}: {diverged}")
+        config["start_from"] = str(newest_checkpoint(start.run))
+    trainer = fit(training.run, config, training.seed, [progress])
     return {
         "train_s": progress.seconds,
         "steps": trainer.global_step,

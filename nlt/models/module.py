@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -295,12 +295,14 @@ class RenderingModule(Method, L.LightningModule):
         checkpoint["architecture"] = {name: self.hparams[name] for name in self.architecture}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check that the checkpoint fits this method.
+        self.check_checkpoint(checkpoint, self._trainer.ckpt_path if self._trainer else None)
+
+    def check_checkpoint(self, checkpoint: Mapping[str, Any], path: str | Path | None) -> None:
+        """Check that a checkpoint, read from `path`, fits this method.
 
         Raises:
             UserError: the checkpoint is of another method or another size.
         """
-        path = self._trainer.ckpt_path if self._trainer else None
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
         # An option that is younger than the checkpoint was off in its training.
@@ -342,7 +344,7 @@ def _in_bfloat16(step: Callable[[Batch, Any], Any]) -> Callable[[Batch, Any], An
     return run
 
 
-def _wrong_method(path: str | Path | None, checkpoint: dict[str, Any], wanted: type) -> UserError:
+def _wrong_method(path: str | Path | None, checkpoint: Mapping[str, Any], wanted: type) -> UserError:
     name = str(checkpoint.get("method", "an unknown method")).rpartition(".")[2]
     return UserError(
         f"{path or 'given'}: checkpoint is of {name}, not {wanted.__name__}: "

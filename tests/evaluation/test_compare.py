@@ -507,6 +507,43 @@ def test_no_embeddings_of_another_room(world, elsewhere, capfd, trainings):
     assert trainings == []
 
 
+@pytest.fixture
+def fine_tuned(world, elsewhere):
+    """A variant that starts from the weights of the other room; its learning rate of zero keeps them."""
+    content = {"start_from": "elsewhere", "model": {"init_args": {"learning_rate": 0.0}}}
+    file = write(world.folder / "configs/variant/fine_tuned.yaml", content)
+    yield file
+    file.unlink()
+
+
+def test_a_method_that_starts_from_another_room(world, fine_tuned, trainings):
+    rows = world.compare("--methods", "cnn@fine_tuned", "cnn", "cnn@elsewhere", out="started")
+    assert trainings[-1].method == "cnn@fine_tuned" and trainings[-1].start.method == "cnn@elsewhere"
+    assert rows["cnn@fine_tuned"]["mse"] == rows["cnn@elsewhere"]["mse"] != rows["cnn"]["mse"]
+    trained_in = Path(world.runs("started")["cnn@fine_tuned"]["run"]).parent.name
+    assert trained_in == world.tiny.dataset.name
+
+
+def test_a_start_is_in_the_comparison(world, fine_tuned, capfd, trainings):
+    assert main(["compare", "--config", str(world.config), "--methods", "cnn", "cnn@fine_tuned", "--out=refused"]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "fine_tuned.yaml: start_from: cnn@elsewhere" in error
+    assert trainings == []
+
+
+def test_a_start_that_fails(world, fine_tuned, more_methods):
+    """The training that starts from it fails with its reason."""
+    more_methods("Diverges", "Killed")
+    rows = world.compare(
+        "--methods", *(f"{m}@{v}" for m in ("diverges", "killed") for v in ("elsewhere", "fine_tuned"))
+    )
+    runs = world.runs("again")
+    assert set(rows) == set(runs)
+    for method, status in (("diverges", "diverged"), ("killed", "failed")):
+        run = runs[f"{method}@fine_tuned"]
+        assert run["status"] == status and run["message"].startswith(f"{method}@elsewhere, seed 3: ")
+
+
 @pytest.mark.parametrize("section", ["model", "trainer", "data"])
 def test_a_mistake_in_the_last_config(world, trainings, capfd, section):
     """Is found before the first training."""
