@@ -181,7 +181,8 @@ def test_a_scale_without_class_path_is_merged(tmp_path):
 def test_sizes(name):
     """From tiny to the paper's, which are the defaults; each has more parameters than the one before."""
     files = {size: find_config("variant", size) for size in config_names("variant")}
-    files = {size: file for size, file in files.items() if re.search(r"\bwidth:", file.read_text())}  # the U-Net's
+    widths = {size: read_configs([file]).get("model", {}).get("init_args", {}) for size, file in files.items()}
+    files = {size: file for size, file in files.items() if {"width", "photon_width"} <= widths[size].keys()}
     made = {size: build(find_config("model", name), file, {}) for size, file in files.items()}
     count = {size: sum(p.numel() for p in method.parameters()) for size, method in made.items()}
     assert sorted(count, key=lambda size: count[size]) == ["tiny", "small", "medium", "large", "paper"]
