@@ -63,8 +63,7 @@ class CloudMethod(RenderingModule):
         """
         gbuffer = self.gbuffer(batch)
         # With more points than pixels, dense maps are faster (docs/performance.md).
-        dense = not self.sparse or self.hparams["patch"] > 1
-        if not dense and clouds and gbuffer[0, 0].numel() >= max(len(valid[0]) for *_, valid in clouds):
+        if self.sparse and clouds and gbuffer[0, 0].numel() >= max(len(valid[0]) for *_, valid in clouds):
             view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
             projected = ((features, visible_pixels(places, valid, **view)) for features, places, valid in clouds)
             return gbuffer, [average_sparsely(*pair, *gbuffer.shape[-2:]) for pair in projected]

@@ -74,7 +74,7 @@ class RenderingModule(Method, L.LightningModule):
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
-    architecture: tuple[str, ...] = ("width", "depth", "patch", "output", "add_emission")
+    architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission")
     # Fast paths at inference, which `nlt.models.policy.accelerate` switches on; see `Policy`.
     sparse = in_bfloat16 = False
 
@@ -82,7 +82,6 @@ class RenderingModule(Method, L.LightningModule):
         self,
         width: int = 64,
         depth: int = 3,
-        patch: int = 1,
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
         loss: Literal["mse", "relative_mse"] = "mse",
@@ -98,7 +97,6 @@ class RenderingModule(Method, L.LightningModule):
         Args:
             width: feature maps of the U-Net's first level.
             depth: number of times the U-Net halves the resolution.
-            patch: side in pixels of the squares that are one pixel to the U-Net; the paper has 1.
             output: how the U-Net's channels become an image. "radiance" is the paper's: three channels are the image.
                 "demodulated": albedo times the first three channels, plus the last three. A method without the albedo
                 as input predicts radiance either way.
@@ -115,14 +113,14 @@ class RenderingModule(Method, L.LightningModule):
             seed: seed of the random numbers that a method draws in training.
         """
         super().__init__()
-        check_at_least(1, width=width, patch=patch)
+        check_at_least(1, width=width)
         check_at_least(0, depth=depth)
         if not 0 <= clip_share <= 1:
             raise UserError(f"model.init_args.clip_share: must be between 0 and 1, is {clip_share}")
         self.save_hyperparameters()
         self.loss = getattr(losses, loss)
         # channels_last is the fastest layout of the convolutions.
-        unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3, patch)
+        unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)
         self.unet = unet.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._metrics: list[ImageMetrics] = []  # in a list, which keeps them out of the parameters and the checkpoint
 
@@ -308,7 +306,7 @@ class RenderingModule(Method, L.LightningModule):
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
         # An option that is younger than the checkpoint was off in its training.
-        saved = dict.fromkeys(self.architecture, False) | {"patch": 1} | checkpoint["architecture"]
+        saved = dict.fromkeys(self.architecture, False) | checkpoint["architecture"]
         different = [name for name in self.architecture if saved[name] != self.hparams[name]]
         if different:
             raise UserError(

@@ -61,17 +61,10 @@ class UNet(nn.Module):
     The supplementary's figure reduces the resolution in three steps and the main text names four blocks:
     `depth` counts the steps. The number of features starts at `width` and doubles at each step. The output is not
     bounded. The last of the `in_channels` may be given as sparse maps.
-
-    With `patch` above 1, not in the paper, a pixel of the U-Net is a square of patch x patch pixels of the image, whose
-    channels are joined (Shi et al. 2016, "sub-pixel convolution").
     """
 
-    def __init__(
-        self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3, patch: int = 1
-    ) -> None:
+    def __init__(self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3) -> None:
         super().__init__()
-        self.patch = patch
-        in_channels, out_channels = in_channels * patch**2, out_channels * patch**2
         widths = [width * 2**level for level in range(depth + 1)]
         self.conv_in = nn.Conv2d(in_channels, width, 3, padding=1)
         self.down = nn.ModuleList(ConvBlock(widths[max(i - 1, 0)], widths[i]) for i in range(depth + 1))
@@ -79,10 +72,6 @@ class UNet(nn.Module):
         self.conv_out = nn.Conv2d(width, out_channels, 3, padding=1)
 
     def forward(self, x: Tensor, sparse: Sequence[SparseMap] = ()) -> Tensor:
-        height, width = x.shape[-2:]
-        if self.patch > 1:
-            x = F.pad(x, (0, -width % self.patch, 0, -height % self.patch), mode="replicate")
-            x = F.pixel_unshuffle(x, self.patch).contiguous(memory_format=torch.channels_last)
         x = self.down[0](sparse_convolution(self.conv_in, x, sparse) if sparse else self.conv_in(x))
         skips = []
         for block in self.down[1:]:
@@ -90,5 +79,4 @@ class UNet(nn.Module):
             x = block(F.max_pool2d(x, 2, ceil_mode=True))  # ceil_mode keeps a side of 1
         for block, skip in zip(self.up, reversed(skips), strict=True):
             x = block(x, skip)
-        x = self.conv_out(F.relu(x))
-        return F.pixel_shuffle(x, self.patch)[..., :height, :width] if self.patch > 1 else x
+        return self.conv_out(F.relu(x))

@@ -72,24 +72,3 @@ def test_receptive_field_spans_the_levels():
     net, x = UNet(1, width=4), torch.zeros(1, 1, 32, 32, requires_grad=True)
     net(x + torch.rand(x.shape))[0, :, 0, 0].sum().backward()
     assert x.grad[0, 0, :, 0].nonzero().max() >= 16
-
-
-@pytest.mark.parametrize("size", [(8, 12), (7, 9)])
-def test_patches_are_pixels_to_the_network(size):
-    """The same weights on pixels that are joined and separated by loops; what is beyond the border repeats it."""
-    joined = UNet(3, width=4, depth=1, out_channels=2, patch=4)
-    plain = UNet(3 * 16, width=4, depth=1, out_channels=2 * 16)
-    plain.load_state_dict(joined.state_dict())
-    x = torch.rand(2, 3, *size)
-    rows, columns = (-(-side // 4) for side in size)
-    squares = torch.empty(2, 3 * 16, rows, columns)
-    for row in range(4 * rows):
-        for column in range(4 * columns):
-            pixel = x[:, :, min(row, size[0] - 1), min(column, size[1] - 1)]
-            squares[:, row % 4 * 4 + column % 4 :: 16, row // 4, column // 4] = pixel
-    found, inner = joined(x), plain(squares)
-    assert found.shape == (2, 2, *size)
-    for row in range(size[0]):
-        for column in range(size[1]):
-            expected = inner[:, row % 4 * 4 + column % 4 :: 16, row // 4, column // 4]
-            torch.testing.assert_close(found[:, :, row, column], expected)
