@@ -166,7 +166,8 @@ class NLTCLI(LightningCLI):
                 "method without them, such as photons_only, or resume with --ckpt_path"
             )
         weights = load_method(checkpoint, "--start_from").state_dict()
-        self.model.check_checkpoint(read_checkpoint(checkpoint), checkpoint)
+        # Only embeddings depend on the number of scenes and points.
+        self.model.check_checkpoint(read_checkpoint(checkpoint), checkpoint, ("num_scenes", "num_points"))
         self.model.load_state_dict(weights)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -297,8 +297,10 @@ class RenderingModule(Method, L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.check_checkpoint(checkpoint, self._trainer.ckpt_path if self._trainer else None)
 
-    def check_checkpoint(self, checkpoint: Mapping[str, Any], path: str | Path | None) -> None:
-        """Check that a checkpoint, read from `path`, fits this method.
+    def check_checkpoint(
+        self, checkpoint: Mapping[str, Any], path: str | Path | None, may_differ: Collection[str] = ()
+    ) -> None:
+        """Check that a checkpoint, read from `path`, fits this method; hyperparameters in `may_differ` do not count.
 
         Raises:
             UserError: the checkpoint is of another method or another size.
@@ -307,7 +309,7 @@ class RenderingModule(Method, L.LightningModule):
             raise _wrong_method(path, checkpoint, type(self))
         # An option that is younger than the checkpoint was off in its training.
         saved = dict.fromkeys(self.architecture, False) | checkpoint["architecture"]
-        different = [name for name in self.architecture if saved[name] != self.hparams[name]]
+        different = [name for name in self.architecture if name not in may_differ and saved[name] != self.hparams[name]]
         if different:
             raise UserError(
                 f"{path or 'given'}: checkpoint has {', '.join(f'{name}={saved[name]}' for name in different)}, "

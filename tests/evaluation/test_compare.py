@@ -481,7 +481,7 @@ def test_trainings_never_have_more_threads_than_cores(tmp_path, monkeypatch, cor
 @pytest.fixture
 def elsewhere(world):
     """A variant that trains in another room, which is larger and has other objects."""
-    dataset = {"scenes": ["bedroom"], "train": 4, "val": 1, "test": 0}
+    dataset = {"scenes": ["bedroom"], "train": 4, "val": 1, "test": 0, "num_points": 32}
     file = write(world.folder / "configs/variant/elsewhere.yaml", {"data": {"dataset": dataset}})
     yield file
     file.unlink()
@@ -517,10 +517,14 @@ def fine_tuned(world, elsewhere):
 
 
 def test_a_method_that_starts_from_another_room(world, fine_tuned, trainings):
-    rows = world.compare("--methods", "cnn@fine_tuned", "cnn", "cnn@elsewhere", out="started")
-    assert trainings[-1].method == "cnn@fine_tuned" and trainings[-1].start.method == "cnn@elsewhere"
-    assert rows["cnn@fine_tuned"]["mse"] == rows["cnn@elsewhere"]["mse"] != rows["cnn"]["mse"]
-    trained_in = Path(world.runs("started")["cnn@fine_tuned"]["run"]).parent.name
+    rows = world.compare(
+        "--methods", "photons_only@fine_tuned", "photons_only", "photons_only@elsewhere", out="started"
+    )
+    assert trainings[-1].method == "photons_only@fine_tuned" and trainings[-1].start.method == "photons_only@elsewhere"
+    assert (
+        rows["photons_only@fine_tuned"]["mse"] == rows["photons_only@elsewhere"]["mse"] != rows["photons_only"]["mse"]
+    )
+    trained_in = Path(world.runs("started")["photons_only@fine_tuned"]["run"]).parent.name
     assert trained_in == world.tiny.dataset.name
 
 
