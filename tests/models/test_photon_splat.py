@@ -107,20 +107,6 @@ def test_equals_the_loop_over_photons(footprint):
     np.testing.assert_allclose(irradiance(batch, footprint)[0].numpy(), expected, rtol=0.01)
 
 
-def test_every_footprint_is_a_box_around_the_pixel():
-    """The channels after the G-buffer are log irradiance and log count of 1x1, 5x5, 17x17 and 65x65 pixels."""
-    batch = plane_batch(500) | {"exposure": torch.full((1,), 0.5, dtype=torch.float64)}
-    method = PhotonSplat(width=2, depth=1, every_footprint=True)
-    flux, count, area = (next(method._footprints(batch, ()))[0].numpy()[part] for part in (np.s_[:3], 3, 4))
-    maps = method.features(batch)[0, 10:].numpy()
-    assert len(maps) == 16 == method.feature_channels - 10
-    for row, column in ((0, 0), (5, 7), (23, 12)):
-        for found, radius in zip(np.split(maps[:, row, column], 4), (0, 2, 8, 32), strict=True):
-            box = np.s_[..., max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
-            expected = np.log1p(0.5 * flux[box].sum((1, 2)) / area[box].sum())
-            np.testing.assert_allclose(found, [*expected, np.log1p(count[box].sum())], rtol=1e-6)
-
-
 def test_no_photons_and_no_surface_are_zeros():
     batch = synthetic_batch()
     assert irradiance(batch, 4).any()
