@@ -15,6 +15,9 @@ publish() {
 room() {
     once nlt compare --data real_living_room_moving_lights --workers "${WORKERS:-2}" "$@"
 }
+fixed_lights() {
+    once nlt compare --data real_living_room_fixed_lights --workers "${WORKERS:-2}" "$@"
+}
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 front="cnn feature_projection nlt nlt_photons guided_1spp guided_1spp_relative
@@ -24,6 +27,9 @@ if [ "$scale" = small ]; then
     room --config table2_real_demodulated --methods $table2 --out results/real_living_room
     room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
     room --config table2_real --scale medium --out results/real_living_room_256_radiance \
+        --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
+    fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
+    fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
     room --config front --methods $front --out results/front_living_room
