@@ -74,10 +74,14 @@ def table(records: list[dict[str, Any]], lines: dict[str, float]) -> str:
 
 
 def run(config: dict[str, Any], spec: DatasetSpec, seed: int) -> dict[str, Any]:
-    """Render the training set, train, and return the minutes of both and the trained method."""
+    """Render the training set, train, and return the minutes of both and the trained method.
+
+    With data.online, training images are rendered while the method trains, and the first step renders points alone.
+    """
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
-        generate(replace(spec, val=0, test=0), folder)
+        stored = spec.without_train() if config["data"].get("online") else spec
+        generate(replace(stored, val=0, test=0), folder)
         rendered = time.perf_counter()
         own = {"data": {"root": folder, "dataset": {"val": 0, "test": 0}}, "trainer": {"limit_val_batches": 0}}
         fit(Path(folder) / "run", merge(config, own), seed)
@@ -111,7 +115,6 @@ def main() -> None:
     device = default_device()
     judge = Evaluation(Frames(LightTransportDataset(directory, tests, "test")), device, Policy.for_device(device))
     lines_file, records_file = out / "lines.json", out / "records.csv"
-    records = read_rows(records_file) if records_file.exists() else []
     if not lines_file.exists():
         peer = build_if_untrained(_PEER)
         assert isinstance(peer, Method)
@@ -134,6 +137,7 @@ def main() -> None:
         "what": options.what, "settings": " ".join(options.set), "seed": options.seed, **result,
         "minutes": result["render_min"] + result["train_min"], **{name: metrics[name] for name in _LINES},
     }  # fmt: skip
+    records = read_rows(records_file) if records_file.exists() else []  # only now: another run may have added one
     lines = {"fid": known["fid"], "mssim": known["mssim"], "mse": (records or [record])[0]["mse"] / 2}
     records.append(record | {"lines": passed(record, lines)})
     write_rows(records_file, records)

@@ -38,18 +38,27 @@ def test_the_table_names_the_fastest_of_each_line():
     assert "| 2026-01-01 | abcdef1 | cnn | quick | 1.00 | 2.00 | 3.00 | 50.0 | 0.5000 | 0.10000 | line 1 |" in text
 
 
-def test_two_runs(tiny, tmp_path, monkeypatch, one_thread):
-    """The first sets the third line; the next has its own number of images and the same test views."""
+def test_three_runs(tiny, tmp_path, monkeypatch, one_thread):
+    """The first sets the third line; the next has its own number of images; the last renders them while it trains."""
     monkeypatch.chdir(tmp_path)
     use_tiny_inception(monkeypatch)
     scale = write(tmp_path / "scale.yaml", {"model": {"init_args": {"width": 2}}, "trainer": {"max_steps": 2}})
     fixed = ["--data", str(tiny.data), "--scale", str(scale)]
-    for more in (["--what", "the first"], ["--what", "fewer images", "--set", "data.dataset.train=4"]):
+    changes = {
+        "the first": [],
+        "fewer images": ["data.dataset.train=4"],
+        "online": ["data.online=true", "data.workers=1"],
+    }
+    for what, settings in changes.items():
+        more = ["--what", what, *(["--set", *settings] if settings else [])]
         monkeypatch.setattr(sys, "argv", ["speedrun.py", "cnn", *fixed, *more])
         runpy.run_path(SCRIPT)["main"]()
-    first, second = read_rows(tmp_path / "results/speedrun/records.csv")
-    assert (first["what"], second["what"], second["settings"]) == ("the first", "fewer images", "data.dataset.train=4")
-    for row in (first, second):
+    first, second, online = rows = read_rows(tmp_path / "results/speedrun/records.csv")
+    assert [(row["what"], row["settings"]) for row in rows[1:]] == [
+        ("fewer images", "data.dataset.train=4"), ("online", "data.online=true data.workers=1"),
+    ]  # fmt: skip
+    assert online["mse"] != first["mse"], "online, the loader's order is that of the renderer"
+    for row in rows:
         assert row["minutes"] == pytest.approx(row["render_min"] + row["train_min"]) and row["train_min"] > 0
     assert "line 3" not in first["lines"] and first["mse"] > 0 and first["mse"] != second["mse"]
     assert f"MSE below {first['mse'] / 2:.4g}" in (tmp_path / "results/speedrun/records.md").read_text()

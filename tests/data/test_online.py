@@ -1,7 +1,6 @@
 """Online training: its samples are those of an endless stored dataset, and each is used once."""
 
 import json
-import runpy
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from nlt.data.online import OnlineDataset
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
-from nlt.paths import CONFIGS, PROJECT
+from nlt.paths import CONFIGS
 
 pytestmark = pytest.mark.slow
 
@@ -121,25 +120,6 @@ def test_mistakes(online, tmp_path):
     stored.setup("fit")
     with pytest.raises(UserError, match=r"data.dataset.train: is 0"):
         stored.train_dataloader()
-
-
-def test_benchmark_reads_the_curves(tmp_path):
-    """The best arm agrees with a computation by hand for two straight curves, one of which starts at 30 s."""
-    functions = runpy.run_path(str(PROJECT / "benchmarks/online.py"))
-    row = lambda arm, extra, t, mse: {"arm": arm, "seed": 0, "generation_s": extra, "train_s": t, "steps": t,
-                                      "images_seen": 8 * t, "mse": mse, "mssim": 1 - mse}  # fmt: skip
-    rows = [row("4 stored", 30, t, 0.5 - 0.004 * t) for t in (10, 60, 101)]
-    rows += [row("online", 0, t, 0.4 - 0.002 * t) for t in (10, 60, 101)]
-    at = lambda arm, budget, account: functions["at"](rows, arm, "mse", budget, account)
-    assert at("online", 5, "without_generation") is None and at("4 stored", 35, "with_generation") is None
-    assert at("4 stored", 80, "without_generation") == pytest.approx(0.18)
-    assert at("4 stored", 80, "with_generation") == pytest.approx(0.3)
-    functions["write_table"](tmp_path / "table.md", rows, [20.0, 100.0])
-    lines = (tmp_path / "table.md").read_text().splitlines()
-    assert [line for line in lines if line.startswith("| 1.66667 ")] == [
-        "| 1.66667 | **0.10000** | 0.20000 | 4 stored |", "| 1.66667 | 0.22000 | **0.20000** | online |",
-        "| 1.66667 | **0.9000** | 0.8000 | 4 stored |", "| 1.66667 | 0.7800 | **0.8000** | online |",
-    ]  # fmt: skip
 
 
 def test_fit(online, tmp_path, monkeypatch, one_thread):
