@@ -17,12 +17,16 @@ def orthogonalize(matrix: Tensor) -> Tensor:
     The coefficients of this Newton-Schulz iteration are Jordan's: they raise small singular values fastest.
     """
     x = matrix / (matrix.norm() + 1e-7)
-    tall = x.shape[0] > x.shape[1]
-    x = x.T if tall else x
+    if x.shape[0] > x.shape[1]:
+        return orthogonalize(x.T).T
+    # Each iteration multiplies x by a polynomial of x x', so the product of these small (n, n) factors is enough.
+    product = identity = torch.eye(len(x), dtype=x.dtype, device=x.device)
+    square = x @ x.T
     for _ in range(_ITERATIONS):
-        square = x @ x.T
-        x = 3.4445 * x + (2.0315 * square @ square - 4.775 * square) @ x
-    return x.T if tall else x
+        factor = 3.4445 * identity + (2.0315 * square @ square - 4.775 * square)
+        product = factor @ product
+        square = factor @ square @ factor
+    return product @ x
 
 
 class Muon(torch.optim.Adam):

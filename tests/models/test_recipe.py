@@ -158,6 +158,21 @@ def test_orthogonalised_matrices(shape):
     torch.testing.assert_close(values, values.diagonal().diag(), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("decay", [2, 6, 12])
+def test_orthogonalised_matrices_whose_singular_values_differ_by_orders_of_magnitude(decay):
+    """In float32, the short iteration on products of rows is as good as the textbook's on the matrix in float64."""
+    generator = torch.Generator().manual_seed(0)
+    left, right = (
+        torch.linalg.qr(torch.randn(size, 16, generator=generator, dtype=torch.double))[0] for size in (16, 90)
+    )
+    matrix = left * torch.logspace(0, -decay, 16, dtype=torch.double) @ right.T
+    expected = matrix / matrix.norm()
+    for _ in range(5):
+        square = expected @ expected.T
+        expected = 3.4445 * expected + (2.0315 * square @ square - 4.775 * square) @ expected
+    assert (orthogonalize(matrix.float()) - expected).norm() < 2e-3 * expected.norm()
+
+
 def test_muon_is_torchs_and_adam_where_it_does_not_apply():
     """Three steps from the same gradients; PyTorch's Muon takes matrices only and computes in bfloat16."""
     generator = torch.Generator().manual_seed(0)
