@@ -29,6 +29,7 @@ from tqdm import tqdm
 from nlt.config import Settings, parse, read_configs
 from nlt.data.datamodule import LightTransportDataModule
 from nlt.data.dataset import LightTransportDataset
+from nlt.data.engines import Process
 from nlt.data.files import write_bytes
 from nlt.data.generate import fill, plan, timed_spp
 from nlt.data.render import SampleRenderer
@@ -49,6 +50,7 @@ from nlt.models.policy import accelerate, default_device
 from nlt.paths import config_names, find_config
 from nlt.rendering.variant import choose_variant
 from nlt.training import quiet, trainer_defaults
+from nlt.waiting import as_the_user_said
 
 _DATASET, _MODEL = ("resolution", "num_points", "num_photons"), ("width", "depth")
 # The factors over which the growth of costs is measured, one at a time around the settings.
@@ -90,6 +92,28 @@ class Part(NamedTuple):
 
     def __str__(self) -> str:
         return " ".join(str(word) for word in self if word)
+
+
+def time_training(
+    method: RenderingModule, data: LightTransportDataModule, device: torch.device, precision: Any, seconds: float
+) -> dict[str, Any]:
+    """Train for up to `seconds`; return images per second, the time of a step and the share of waiting for data."""
+    steps = _Steps(seconds, device)
+    quiet()
+    trainer = L.Trainer(
+        max_steps=1 + _TRAINING_STEPS, accelerator="gpu" if device.type == "cuda" else "cpu", devices=1,
+        callbacks=[steps], logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, precision=precision,
+    )  # fmt: skip
+    trainer.fit(method.train(), datamodule=data)
+    whole = [a + b for a, b in zip(steps.waited, steps.computed, strict=True)]
+    return {
+        "images_per_second": data.batch_size / statistics.median(whole),
+        "step_s": statistics.median(whole),
+        "step_p95_s": float(np.percentile(whole, 95)),
+        "waiting_share": sum(steps.waited) / sum(whole),
+        "timed_steps": len(whole),
+    }
 
 
 class Benchmark:
@@ -317,25 +341,12 @@ class Benchmark:
         if 2 * step > self.seconds:
             why = f"2 steps of batch {size} are predicted to take {2 * step:.0f} s, more than {self.seconds:g} s"
             return {"skipped": why}
-        data, method = self.data(), self.method(name, self.settings)
-        assert isinstance(method, RenderingModule)
-        steps = _Steps(self.seconds, self.device)
         precision = {**trainer_defaults(), **self.config.get("trainer", {})}.get("precision")
-        quiet()
-        trainer = L.Trainer(
-            max_steps=1 + _TRAINING_STEPS, accelerator="gpu" if self.device.type == "cuda" else "cpu", devices=1,
-            callbacks=[steps], logger=False, enable_checkpointing=False, enable_progress_bar=False,
-            enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, precision=precision,
-        )  # fmt: skip
-        trainer.fit(method.train(), datamodule=data)
-        whole = [a + b for a, b in zip(steps.waited, steps.computed, strict=True)]
-        return {
-            "images_per_second": size / statistics.median(whole),
-            "step_s": statistics.median(whole),
-            "step_p95_s": float(np.percentile(whole, 95)),
-            "waiting_share": sum(steps.waited) / sum(whole),
-            "timed_steps": len(whole),
-        }
+        with as_the_user_said():  # a process of its own, whose threads wait as those of `nlt fit` do
+            training = Process(
+                time_training, self.method(name, self.settings), self.data(), self.device, precision, self.seconds
+            )
+        return training.result()
 
     def _loading(self) -> dict[str, Any]:
         """Measure samples per second of the DataLoader alone, with all fields and CRCs, from cached files."""
