@@ -58,38 +58,38 @@ def visible_pixels(
     in_front = view[:, 2] > 0
     x, y = (homogeneous[:, :2] / torch.where(in_front, view[:, 2], 1)[:, None]).unbind(1)
     candidate = valid & in_front & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    x, y = torch.where(candidate, x, 0), torch.where(candidate, y, 0)
+    image, point = candidate.nonzero(as_tuple=True)
+    x, y, homogeneous = x[image, point], y[image, point], homogeneous[image, :, point]
 
     # The plane of a pixel is n . (v - x) = 0 in view space, where v = K^-1 (K T p) and x = depth K^-1 centre.
     to_pixels = _transform(torch.linalg.inv_ex(camera_matrix)[0].mT, world_to_view[:, :3, :3])
-    few_points = 4 * x.shape[1] < height * width  # then only their planes are computed
+    few_points = 4 * positions.shape[1] < height * width  # then only their planes are computed
     if not few_points:
         column, row = (torch.arange(size, device=depth.device) for size in (width, height))
         everywhere = (column.repeat(height), row.repeat_interleave(width))
         planes = _tangent_planes(to_pixels, depth.flatten(2), normal.flatten(2), *everywhere).mT.flatten(0, 1)
-    first = height * width * torch.arange(len(depth), device=depth.device)[:, None]
     unoccluded = torch.zeros_like(x)
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
     for i, j in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
         weight = (1 - (x - 0.5 - i).abs()) * (1 - (y - 0.5 - j).abs())
         column, row = i.long().clamp(0, width - 1), j.long().clamp(0, height - 1)
-        at = row * width + column
         if few_points:
-            plane = _tangent_planes(to_pixels, _at(depth, at), _at(normal, at), column, row)
+            surface = (m[image, :, row, column, None] for m in (depth, normal))
+            plane = _tangent_planes(to_pixels[image], *surface, column[:, None], row[:, None])[..., 0]
         else:
-            plane = planes[first + at].mT
+            plane = planes[(image * height + row) * width + column]
         relative_depth = (plane * homogeneous).sum(1)
         unoccluded += weight * (relative_depth <= 1 + epsilon)
-    return torch.where(candidate & (unoccluded > 0.5), y.long() * width + x.long(), height * width)
-
-
-def _at(image: Tensor, pixels: Tensor) -> Tensor:
-    """Return the values (B, C, K) of an image (B, C, H, W) at pixels (B, K), row * W + column."""
-    return image.flatten(2).gather(2, pixels[:, None].expand(-1, image.shape[1], -1))
+    pixels = torch.full_like(candidate, height * width, dtype=torch.int64)
+    pixels[image, point] = torch.where(unoccluded > 0.5, y.long() * width + x.long(), height * width)
+    return pixels
 
 
 def _tangent_planes(to_pixels: Tensor, depth: Tensor, normal: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Return w (B, 3, K) of K pixels: w . K T p is p's depth over that of the pixel's plane along p's ray."""
+    """Return w (B, 3, K) of K pixels: w . K T p is p's depth over that of the pixel's plane along p's ray.
+
+    to_pixels (B, 3, 3), depth (B, 1, K), normal (B, 3, K); column and row (K,) or (B, K).
+    """
     m = _transform(to_pixels, normal.to(depth.dtype))
     along = m[:, 0] * (column + 0.5) + m[:, 1] * (row + 0.5) + m[:, 2]
     return torch.where(depth > 0, m / (depth * along[:, None]), 0)  # no hit is infinitely far
