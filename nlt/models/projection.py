@@ -74,8 +74,8 @@ def visible_pixels(
         weight = (1 - (x - 0.5 - i).abs()) * (1 - (y - 0.5 - j).abs())
         column, row = i.long().clamp(0, width - 1), j.long().clamp(0, height - 1)
         if few_points:
-            surface = (m[image, :, row, column, None] for m in (depth, normal))
-            plane = _tangent_planes(to_pixels[image], *surface, column[:, None], row[:, None])[..., 0]
+            depths, normals = depth[image, :, row, column, None], normal[image, :, row, column, None]
+            plane = _tangent_planes(to_pixels[image], depths, normals, column[:, None], row[:, None])[..., 0]
         else:
             plane = planes[(image * height + row) * width + column]
         relative_depth = (plane * homogeneous).sum(1)
