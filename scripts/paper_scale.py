@@ -24,7 +24,7 @@ def _rates(bench: Path) -> tuple[dict, dict, dict, dict]:
     return results["manifest"], kinds["generation"], kinds["training"], kinds["frame"]
 
 
-def tables(bench: Path) -> str:
+def tables(bench: Path = PROJECT / "results/bench/target") -> str:
     """Return the measured rates and the cost of the paper's Table 2 at these rates, as Markdown."""
     manifest, generation, training, frame = _rates(bench)
     files = [str(find_config("data", "builtin_moving_lights")), str(find_config("scale", "paper"))]
@@ -73,4 +73,4 @@ def tables(bench: Path) -> str:
 
 
 if __name__ == "__main__":
-    print(tables(PROJECT / (sys.argv[1] if len(sys.argv) > 1 else "results/bench/target")))
+    print(tables(*map(Path, sys.argv[1:2])))

@@ -36,6 +36,9 @@ if [ "$scale" = small ]; then
     room --config front --scale medium --methods $front guided_1spp@other_rooms guided_1spp_relative@other_rooms \
         --out results/front_living_room_256
     room --config other_rooms --scale medium --out results/other_rooms
+    room --config small_images_first --scale medium --out results/small_images_first
+    room --config table2_real --out results/real_living_room_radiance \
+        --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
 fi
 for comparison in table2_real table1_real ablation table2_builtin table1_builtin; do
     publish --config "$comparison" --seeds 3

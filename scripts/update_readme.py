@@ -2,7 +2,8 @@
 
 Each block between `<!-- SOURCE -->` and `<!-- end -->` is generated again. SOURCE is a table of results
 (`results/NAME/table.md`, whose first table is shown), another page of results (shown whole, for example
-`results/NAME/stress/stress.md`), a group of fields (`nlt/data/sample.py FIELDS`) or `scripts/paper_scale.py`.
+`results/NAME/stress/stress.md`), a group of fields (`nlt/data/sample.py FIELDS`), or a script with a function
+`tables()` (`scripts/paper_scale.py`).
 """
 
 import re
@@ -20,8 +21,8 @@ def content(source: str) -> str:
     path, _, name = source.partition(" ")
     if path == "nlt/data/sample.py":
         return field_table(getattr(sample, name))
-    if path == "scripts/paper_scale.py":
-        return str(runpy.run_path(str(PROJECT / path))["tables"](PROJECT / "results/bench/target"))
+    if path.startswith("scripts/"):
+        return str(runpy.run_path(str(PROJECT / path))["tables"]())
     return first_table(PROJECT / path) if path.endswith("/table.md") else body(PROJECT / path)
 
 

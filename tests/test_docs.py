@@ -47,6 +47,7 @@ def test_copies_are_as_they_stand():
         "results/real_living_room/table.md",
         "nlt/data/sample.py FIELDS",
         "scripts/paper_scale.py",
+        "scripts/claims.py",
         "results/recipe/table.md",
     ):
         assert f"<!-- {source} -->" in copied

@@ -1,0 +1,62 @@
+"""Prints the verdicts on the paper's claims by scale: `python scripts/claims.py`.
+
+A row per claim, a column per folder of results/ whose methods were trained with the recipe's learning rate.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from nlt.evaluation.claims import claims_of
+from nlt.report.table_writer import grid
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+TITLES = {"table1": "Claims on Table 1", "table2": "Claims on Table 2"}
+
+
+def tables() -> str:
+    """Return a table for each of the paper's tables, in Markdown."""
+    text = []
+    for table, title in TITLES.items():
+        folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table)]
+        verdicts = {folder: _verdicts(folder) for folder in folders}
+        claims = [claim["id"] for claim in claims_of(table)]
+        rows = [[claim, *(verdicts[folder].get(claim, "") for folder in folders)] for claim in claims]
+        holding = [f"{sum(v == 'holds' for v in verdicts[f].values())} of {len(verdicts[f])}" for f in folders]
+        rows.append(["**hold**", *holding])
+        text += grid([title, *map(_heading, folders)], rows, numbers=False)
+    return "\n".join(text).strip()
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "manifest.json").read_text())  # type: ignore[no-any-return]
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    """Return the config of one method; the settings read here are those of all of them."""
+    return next(config for config in _manifest(folder)["configs"].values() if "trainer" in config)
+
+
+def _is_current(folder: Path, table: str) -> bool:
+    if not (folder / "claims.md").exists() or _manifest(folder)["table"] != table:
+        return False
+    return bool(_config(folder)["model"]["init_args"].get("lr_schedule") == "cosine")
+
+
+def _verdicts(folder: Path) -> dict[str, str]:
+    """Return the measured claims' verdicts, by the claims' names."""
+    found = re.findall(r"^\| (\S+) \| \*\*([^*]+)\*\*", (folder / "claims.md").read_text(), re.MULTILINE)
+    return {claim: verdict for claim, verdict in found if verdict != "not measured"}
+
+
+def _heading(folder: Path) -> str:
+    manifest, config = _manifest(folder), _config(folder)
+    size, seeds = config["data"]["dataset"]["resolution"], len(manifest["seeds"])
+    scene, output = ", ".join(manifest["scenes"]).replace("_", " "), manifest["variant"] or "radiance"
+    steps = f"{config['trainer']['max_steps']:,} steps" + (f" x {seeds}" if seeds > 1 else "")
+    return f"[{scene}, {size}x{size}, {output}, {steps}](../results/{folder.name}/claims.md)"
+
+
+if __name__ == "__main__":
+    print(tables())
