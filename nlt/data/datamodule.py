@@ -36,6 +36,7 @@ class ThreadLoader(DataLoader):
             yield from super().__iter__()
             return
         # With more than one torch thread per reader, the threads would spin while they wait for each other.
+        torch.set_num_threads(torch.get_num_threads())  # unless it is set, this thread takes over the readers' number
         pool = ThreadPoolExecutor(self.num_workers, "reader", torch.set_num_threads, (1,))
         ahead: deque[Future] = deque()
         try:

@@ -2,7 +2,10 @@
 
 import dataclasses
 import json
+import os
 import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -372,3 +375,14 @@ def test_two_scenes(tmp_path):
 def test_train_images_that_are_not_there(more):
     with pytest.raises(UserError, match=r"data.train_images: must be 1 to data.dataset.train \(12\)"):
         LightTransportDataModule(spec_of(), **more)
+
+
+def test_readers_leave_the_cores_to_the_training():
+    """The readers compute with one thread each; the thread that trains keeps all of its own."""
+    program = (
+        "import torch; from nlt.data.datamodule import ThreadLoader\n"
+        "list(ThreadLoader([1.0, 2.0], num_workers=1)); print(torch.get_num_threads())"
+    )
+    command = [sys.executable, "-c", program]  # a new process: this one may have set its number of threads already
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    assert subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout == "2\n"
