@@ -166,7 +166,7 @@ def test_everything_is_there_and_adds_up(made):
             assert row["flops"] == sum(row["step_flops"].values()) and row["precision"] in ("float32", "bfloat16")
             training = rows["training", method, "", 0]
             assert training["images_per_second"] * training["step_s"] == pytest.approx(2)
-            assert 0 <= training["waiting_share"] < 1 and training["timed_steps"] <= 3
+            assert 0 <= training["waiting_share"] < 1 and 1 <= training["timed_steps"] <= 40
     for factor, values in GRID.items():
         for value in {*values, settings[factor]}:
             assert rows["growth", "nlt_photons", factor, value]["time_per_frame_s"] > 0

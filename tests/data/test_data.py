@@ -381,7 +381,8 @@ def test_readers_leave_the_cores_to_the_training():
     """The readers compute with one thread each; the thread that trains keeps all of its own."""
     program = (
         "import torch; from nlt.data.datamodule import ThreadLoader\n"
-        "list(ThreadLoader([1.0, 2.0], num_workers=1)); print(torch.get_num_threads())"
+        "dataset = torch.utils.data.Subset([1.0, 2.0], [0, 1])\n"
+        "list(ThreadLoader(dataset, num_workers=1)); print(torch.get_num_threads())"
     )
     command = [sys.executable, "-c", program]  # a new process: this one may have set its number of threads already
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
