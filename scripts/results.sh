@@ -48,6 +48,7 @@ for comparison in ablation_real static_kitchen_real static_bathroom_real static_
 done
 once nlt stress --config table2_real --scale "$scale" --views 1
 if [ "$scale" = small ]; then
+    once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/recipe
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
     once nlt compare --config diagnosis
