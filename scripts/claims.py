@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nlt.evaluation.claims import claims_of
+from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -19,11 +20,11 @@ def tables() -> str:
     """Return a table for each of the paper's tables, in Markdown."""
     text = []
     for table, title in TITLES.items():
-        folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table)]
+        folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table) and _verdicts(folder)]
         verdicts = {folder: _verdicts(folder) for folder in folders}
         claims = [claim["id"] for claim in claims_of(table)]
         rows = [[claim, *(verdicts[folder].get(claim, "") for folder in folders)] for claim in claims]
-        holding = [f"{sum(v == 'holds' for v in verdicts[f].values())} of {len(verdicts[f])}" for f in folders]
+        holding = [f"{sum('holds' in v for v in verdicts[f].values())} of {len(verdicts[f])}" for f in folders]
         rows.append(["**hold**", *holding])
         text += grid([title, *map(_heading, folders)], rows, numbers=False)
     return "\n".join(text).strip()
@@ -45,9 +46,10 @@ def _is_current(folder: Path, table: str) -> bool:
 
 
 def _verdicts(folder: Path) -> dict[str, str]:
-    """Return the measured claims' verdicts, by the claims' names."""
-    found = re.findall(r"^\| (\S+) \| \*\*([^*]+)\*\*", (folder / "claims.md").read_text(), re.MULTILINE)
-    return {claim: verdict for claim, verdict in found if verdict != "not measured"}
+    """Return the measured claims' verdicts, by the claims' names; with ≈ if the references may not tell."""
+    found = re.findall(r"^\| (\S+) \| \*\*([^*]+)\*\* \|(.*)", (folder / "claims.md").read_text(), re.MULTILINE)
+    measured = [(claim, verdict, row) for claim, verdict, row in found if verdict != "not measured"]
+    return {claim: f"{verdict} ≈" if BELOW_FLOOR in row else verdict for claim, verdict, row in measured}
 
 
 def _heading(folder: Path) -> str:
