@@ -26,6 +26,7 @@ front="cnn feature_projection nlt nlt_photons guided_1spp guided_1spp_relative
 if [ "$scale" = small ]; then
     room --config table2_real_demodulated --methods $table2 --out results/real_living_room
     room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
+    once python benchmarks/error_spectra.py results/real_living_room_256
     room --config table2_real --scale medium --out results/real_living_room_256_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
@@ -33,8 +34,10 @@ if [ "$scale" = small ]; then
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
     room --config front --methods $front --out results/front_living_room
-    room --config front --scale medium --methods $front guided_1spp@other_rooms guided_1spp_relative@other_rooms \
-        --out results/front_living_room_256
+    room --config front --scale medium --out results/front_living_room_256 \
+        --methods cnn feature_projection nlt nlt_photons photons_only guided_1_64 guided_1_16 guided_1_16@thin guided_1_4 \
+        guided_1spp guided_1spp@thin guided_1spp@other_rooms oidn_1_fast oidn_1_balanced oidn_1 oidn_4 \
+        path_tracing_1 path_tracing_4
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
