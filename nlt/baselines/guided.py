@@ -2,8 +2,11 @@
 
 from typing import Any
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from nlt.errors import UserError
 from nlt.models.module import Batch, join_channels, log_exposed
 from nlt.models.nlt import NeuralLightTransport
 
@@ -18,10 +21,10 @@ class GuidedOneSample(NeuralLightTransport):
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    architecture = (*NeuralLightTransport.architecture, "relative")
+    architecture = (*NeuralLightTransport.architecture, "relative", "every")
 
     def __init__(
-        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, **kwargs: Any
+        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, every: int = 1, **kwargs: Any
     ) -> None:
         """The keyword arguments are those of the base class.
 
@@ -30,7 +33,10 @@ class GuidedOneSample(NeuralLightTransport):
             use_photons: use the photons, as the paper's method does.
             relative: read and predict radiance relative to the noisy image's own mean in each colour channel. Light
                 transport is linear in each channel, so the method then follows any colour and brightness of the light.
+            every: path trace every k-th pixel of every k-th row; its value stands for the k x k pixels around it.
         """
+        if every < 1:
+            raise UserError(f"model.init_args.every: must be 1 or more, is {every}")
         super().__init__(use_points, use_photons, **kwargs)
 
     @property
@@ -45,9 +51,20 @@ class GuidedOneSample(NeuralLightTransport):
     def stages(self) -> tuple[str, ...]:
         return (*super().stages, "path_tracing")
 
+    @property
+    def pixel_fraction(self) -> float:
+        return 1 / self.hparams["every"] ** 2
+
+    def mask(self, batch: Batch, height: int, width: int) -> Tensor:
+        """Return the pixels to trace (B, 1, height, width), the same ones in every image."""
+        mask = torch.zeros(len(batch["scene"]), 1, height, width, dtype=torch.bool, device=batch["scene"].device)
+        self._traced(mask)[:] = True
+        return mask
+
     def gbuffer(self, batch: Batch) -> Tensor:
         """Return the G-buffer and the noisy radiance without lamps in view, divided by the albedo (B, 13, H, W)."""
-        return join_channels([super().gbuffer(batch), log_exposed(_reflected(batch), self._exposure(batch))])
+        reflected = F.interpolate(log_exposed(self._reflected(batch), self._exposure(batch)), batch["depth"].shape[2:])
+        return join_channels([super().gbuffer(batch), reflected])
 
     def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
         return super().to_radiance(batch | {"exposure": self._exposure(batch)}, channels)
@@ -57,10 +74,15 @@ class GuidedOneSample(NeuralLightTransport):
         if not self.hparams["relative"]:
             return batch["exposure"]
         # This mean grows in proportion to the light, as the usual one does, but a firefly hardly changes it.
-        mean = _reflected(batch).sqrt().mean((2, 3)) ** 2
+        mean = self._reflected(batch).sqrt().mean((2, 3)) ** 2
         return 1 / mean.clamp(min=_DARKEST)
 
+    def _reflected(self, batch: Batch) -> Tensor:
+        """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, H / k, W / k)."""
+        noisy, emission, albedo = (self._traced(batch[name]) for name in ("noisy", "emission", "albedo"))
+        return (noisy - emission).clamp(min=0) / (albedo + _LEAST_ALBEDO)
 
-def _reflected(batch: Batch) -> Tensor:
-    """Return the noisy radiance without lamps in view, divided by the albedo (B, 3, H, W)."""
-    return (batch["noisy"] - batch["emission"]).clamp(min=0) / (batch["albedo"] + _LEAST_ALBEDO)
+    def _traced(self, image: Tensor) -> Tensor:
+        """Return the traced pixels of an image (B, C, H, W), which are in the middle of their k x k pixels."""
+        every = self.hparams["every"]
+        return image[..., every // 2 :: every, every // 2 :: every]

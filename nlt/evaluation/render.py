@@ -113,7 +113,10 @@ class ModelRenderer:
         tensors = self._tensors(self.scene, self._state | view, number)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
         batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
-        return batch | {"noisy_input": self._trace_input_pixels(batch, camera, seeds)} if sparse else batch
+        if sparse:
+            (name,) = {*self.method.fields} & {*TRACED}
+            batch[name] = self._trace_input_pixels(batch, camera, seeds)
+        return batch
 
     def _trace_input_pixels(self, batch: Batch, camera: Camera, seeds: np.random.SeedSequence) -> Tensor:
         """Return radiance (1, 3, H, W) traced only at the method's input pixels; 0 elsewhere."""
@@ -121,7 +124,8 @@ class ModelRenderer:
         image = np.zeros((3, *mask.shape), np.float32)
         seed = int(seeds.generate_state(1)[0])
         with self.stage("path_tracing"):
-            image[:, mask] = self.render.radiance(camera, self.spec.input_spp, seed, np.flatnonzero(mask))
+            spp = self.spec.samples(self.method.fields)
+            image[:, mask] = self.render.radiance(camera, spp, seed, np.flatnonzero(mask))
         return torch.from_numpy(image)[None].to(self.device)
 
     def _set_state(self, state: SceneState) -> None:

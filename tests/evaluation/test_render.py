@@ -109,14 +109,20 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light, size):
         assert (picture[:12] == np.concatenate([e.round().numpy() for e in expected], 1)).all()
 
 
-def test_traces_only_the_pixels_that_the_method_looks_at():
-    method = SparseDenoising(one_in=16, width=2, depth=1)
-    model = ModelRenderer(method, spec_of(input_spp=64), 0, CPU)
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        (SparseDenoising(one_in=16, width=2, depth=1), "noisy_input"),
+        (GuidedOneSample(every=4, width=2, depth=1), "noisy"),
+    ],
+)
+def test_traces_only_the_pixels_that_the_method_looks_at(method, name):
+    model = ModelRenderer(method, spec_of(input_spp=64, noisy_spp=64), 0, CPU)
     description = model.render.description
     (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
     batch = model.batch(moment, view)
     looked = method.mask(batch, SIZE[1], SIZE[0])[0, 0]
-    given = batch["noisy_input"][0]
+    given = batch[name][0]
     assert looked.sum() == 12 and (given[:, ~looked] == 0).all()
     whole = model.traced(moment, view, 1024, 0)[0]
     noise = model.render.radiance(view, 64, 1) - whole.numpy()  # of as many samples, at all pixels

@@ -504,14 +504,33 @@ def test_mask_is_fixed_in_evaluation_and_fresh_in_training(step):
     assert torch.equal(method.mask(single, 16, 16), d[2:3])  # wherever in a batch the sample is
 
 
-def test_pixels_not_traced_have_no_influence():
-    batch, method = synthetic_batch(), SparseDenoising(one_in=4, width=4).eval()
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        (SparseDenoising(one_in=4, width=4), "noisy_input"),
+        (GuidedOneSample(every=2, width=4), "noisy"),
+        (GuidedOneSample(every=3, width=4, relative=True), "noisy"),
+    ],
+)
+@torch.no_grad()
+def test_pixels_not_traced_have_no_influence(method, name):
+    batch, method = synthetic_batch(), method.eval()
     expected, mask = method(batch), method.mask(batch, 16, 16)
-    noise = batch["noisy_input"]
-    batch["noisy_input"] = torch.where(mask, noise, torch.nan)
+    assert mask.double().mean() == pytest.approx(method.pixel_fraction, rel=0.2)
+    noise = batch[name]
+    batch[name] = torch.where(mask, noise, torch.nan)
     assert torch.equal(method(batch), expected)
-    batch["noisy_input"] = torch.where(mask, noise + 1, noise)
+    batch[name] = torch.where(mask, noise + 1, noise)
     assert not torch.equal(method(batch), expected)
+
+
+def test_a_traced_pixel_stands_for_those_around_it():
+    batch, method = synthetic_batch(), GuidedOneSample(every=4, width=4)
+    reflected = method.gbuffer(batch)[:, 10:]
+    assert reflected.shape[2:] == (16, 16)
+    own = GuidedOneSample(width=4).gbuffer(batch)[:, 10:]
+    blocks = own[..., 2::4, 2::4].repeat_interleave(4, 2).repeat_interleave(4, 3)
+    assert torch.equal(reflected, blocks) and not torch.equal(reflected, own)
 
 
 @pytest.mark.parametrize("one_in", [1, 4, 16, 32, 64])
