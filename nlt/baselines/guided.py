@@ -21,10 +21,10 @@ class GuidedOneSample(NeuralLightTransport):
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    architecture = (*NeuralLightTransport.architecture, "relative", "every")
+    architecture = (*NeuralLightTransport.architecture, "relative", "gap")
 
     def __init__(
-        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, every: int = 1, **kwargs: Any
+        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, gap: int = 0, **kwargs: Any
     ) -> None:
         """The keyword arguments are those of the base class.
 
@@ -33,10 +33,11 @@ class GuidedOneSample(NeuralLightTransport):
             use_photons: use the photons, as the paper's method does.
             relative: read and predict radiance relative to the noisy image's own mean in each colour channel. Light
                 transport is linear in each channel, so the method then follows any colour and brightness of the light.
-            every: path trace every k-th pixel of every k-th row; its value stands for the k x k pixels around it.
+            gap: leave out as many pixels between two traced ones, in rows and columns. With k = gap + 1, a traced pixel
+                stands for the k x k pixels around it.
         """
-        if every < 1:
-            raise UserError(f"model.init_args.every: must be 1 or more, is {every}")
+        if gap < 0:
+            raise UserError(f"model.init_args.gap: must be 0 or more, is {gap}")
         super().__init__(use_points, use_photons, **kwargs)
 
     @property
@@ -53,7 +54,7 @@ class GuidedOneSample(NeuralLightTransport):
 
     @property
     def pixel_fraction(self) -> float:
-        return 1 / self.hparams["every"] ** 2
+        return 1 / (self.hparams["gap"] + 1) ** 2
 
     def mask(self, batch: Batch, height: int, width: int) -> Tensor:
         """Return the pixels to trace (B, 1, height, width), the same ones in every image."""
@@ -84,5 +85,5 @@ class GuidedOneSample(NeuralLightTransport):
 
     def _traced(self, image: Tensor) -> Tensor:
         """Return the traced pixels of an image (B, C, H, W), which are in the middle of their k x k pixels."""
-        every = self.hparams["every"]
-        return image[..., every // 2 :: every, every // 2 :: every]
+        k = self.hparams["gap"] + 1
+        return image[..., k // 2 :: k, k // 2 :: k]

@@ -113,7 +113,7 @@ def test_frames_are_predictions(models, tmp_path, monkeypatch, light, size):
     ("method", "name"),
     [
         (SparseDenoising(one_in=16, width=2, depth=1), "noisy_input"),
-        (GuidedOneSample(every=4, width=2, depth=1), "noisy"),
+        (GuidedOneSample(gap=3, width=2, depth=1), "noisy"),
     ],
 )
 def test_traces_only_the_pixels_that_the_method_looks_at(method, name):

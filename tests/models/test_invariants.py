@@ -165,7 +165,7 @@ def test_a_scene_elsewhere(method):
 def test_a_mirrored_camera(method):
     """What feeds the U-Net is mirrored, the U-Net itself need not be; which pixels are traced is not the camera's."""
     if "path_tracing" in method.stages:
-        method.hparams["one_in"] = method.hparams["every"] = 1
+        method.hparams.update(one_in=1, gap=0)
     batch, method = double(synthetic_batch(size=13)), method.double()
     torch.testing.assert_close(features(method, mirrored(batch)), features(method, batch).flip(-1))
 

@@ -508,8 +508,8 @@ def test_mask_is_fixed_in_evaluation_and_fresh_in_training(step):
     ("method", "name"),
     [
         (SparseDenoising(one_in=4, width=4), "noisy_input"),
-        (GuidedOneSample(every=2, width=4), "noisy"),
-        (GuidedOneSample(every=3, width=4, relative=True), "noisy"),
+        (GuidedOneSample(gap=1, width=4), "noisy"),
+        (GuidedOneSample(gap=2, width=4, relative=True), "noisy"),
     ],
 )
 @torch.no_grad()
@@ -525,7 +525,7 @@ def test_pixels_not_traced_have_no_influence(method, name):
 
 
 def test_a_traced_pixel_stands_for_those_around_it():
-    batch, method = synthetic_batch(), GuidedOneSample(every=4, width=4)
+    batch, method = synthetic_batch(), GuidedOneSample(gap=3, width=4)
     reflected = method.gbuffer(batch)[:, 10:]
     assert reflected.shape[2:] == (16, 16)
     own = GuidedOneSample(width=4).gbuffer(batch)[:, 10:]
