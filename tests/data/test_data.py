@@ -385,5 +385,6 @@ def test_readers_leave_the_cores_to_the_training():
         "list(ThreadLoader(dataset, num_workers=1)); print(torch.get_num_threads())"
     )
     command = [sys.executable, "-c", program]  # a new process: this one may have set its number of threads already
-    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    # PyTorch obeys MKL's number before OpenMP's, and Dask may have set both in the environment of these tests.
+    environment = {**os.environ, "OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2"}
     assert subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout == "2\n"
