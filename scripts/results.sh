@@ -36,7 +36,7 @@ if [ "$scale" = small ]; then
     room --config front --methods $front --out results/front_living_room
     room --config front --scale medium --out results/front_living_room_256 \
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
-        guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
+        guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first

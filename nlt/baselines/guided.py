@@ -21,10 +21,16 @@ class GuidedOneSample(NeuralLightTransport):
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    architecture = (*NeuralLightTransport.architecture, "relative", "gap")
+    architecture = (*NeuralLightTransport.architecture, "relative", "gap", "rows_only")
 
     def __init__(
-        self, use_points: bool = False, use_photons: bool = False, relative: bool = False, gap: int = 0, **kwargs: Any
+        self,
+        use_points: bool = False,
+        use_photons: bool = False,
+        relative: bool = False,
+        gap: int = 0,
+        rows_only: bool = False,
+        **kwargs: Any,
     ) -> None:
         """The keyword arguments are those of the base class.
 
@@ -35,6 +41,7 @@ class GuidedOneSample(NeuralLightTransport):
                 transport is linear in each channel, so the method then follows any colour and brightness of the light.
             gap: leave out as many pixels between two traced ones, in rows and columns. With k = gap + 1, a traced pixel
                 stands for the k x k pixels around it.
+            rows_only: leave out rows, not columns; a traced pixel stands for the k pixels around it in its column.
         """
         if gap < 0:
             raise UserError(f"model.init_args.gap: must be 0 or more, is {gap}")
@@ -54,7 +61,8 @@ class GuidedOneSample(NeuralLightTransport):
 
     @property
     def pixel_fraction(self) -> float:
-        return 1 / (self.hparams["gap"] + 1) ** 2
+        rows, columns = self._steps
+        return 1 / (rows * columns)
 
     def mask(self, batch: Batch, height: int, width: int) -> Tensor:
         """Return the pixels to trace (B, 1, height, width), the same ones in every image."""
@@ -79,11 +87,17 @@ class GuidedOneSample(NeuralLightTransport):
         return 1 / mean.clamp(min=_DARKEST)
 
     def _reflected(self, batch: Batch) -> Tensor:
-        """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, H / k, W / k)."""
+        """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, rows, columns)."""
         noisy, emission, albedo = (self._traced(batch[name]) for name in ("noisy", "emission", "albedo"))
         return (noisy - emission).clamp(min=0) / (albedo + _LEAST_ALBEDO)
 
     def _traced(self, image: Tensor) -> Tensor:
-        """Return the traced pixels of an image (B, C, H, W), which are in the middle of their k x k pixels."""
+        """Return the traced pixels of an image (B, C, H, W), each in the middle of those that it stands for."""
+        rows, columns = self._steps
+        return image[..., rows // 2 :: rows, columns // 2 :: columns]
+
+    @property
+    def _steps(self) -> tuple[int, int]:
+        """The distance from a traced pixel to the next, in rows and in columns."""
         k = self.hparams["gap"] + 1
-        return image[..., k // 2 :: k, k // 2 :: k]
+        return k, 1 if self.hparams["rows_only"] else k

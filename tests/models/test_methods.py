@@ -509,6 +509,7 @@ def test_mask_is_fixed_in_evaluation_and_fresh_in_training(step):
     [
         (SparseDenoising(one_in=4, width=4), "noisy_input"),
         (GuidedOneSample(gap=1, width=4), "noisy"),
+        (GuidedOneSample(gap=1, rows_only=True, width=4), "noisy"),
         (GuidedOneSample(gap=2, width=4, relative=True), "noisy"),
     ],
 )
