@@ -69,6 +69,9 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
     for k, m in enumerate(_alone(results, families)):
         point = {m: points[m]} if m in points else {}
         _plot(axis, results, key, point, label=label(m), ls="", mec="white", mew=0.6, zorder=3, **plots.style(k))
+    if METRICS[key].direction == "lower":  # else a single path-traced row would press all others together
+        axis.set_yscale("log")
+        _set_ticks(axis.yaxis)
     axis.margins(0.09, 0.12)
     axis.set_title(heading(key))
 
