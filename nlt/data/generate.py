@@ -170,14 +170,16 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
 
 
 def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
-    """Divide the missing files into jobs."""
+    """Divide the missing files into jobs: as many for each worker, so that none is idle at the end."""
     jobs, shards = [], _shards(spec, missing)
     most = max(1, min(SAMPLES_PER_JOB // spec.shard_size, -(-len(shards) // workers)))  # shards of a job
+    multiple = workers // math.gcd(workers, len(spec.scenes))  # of jobs of a scene
     for scene in range(len(spec.scenes)):
         in_scene = [shard for shard in shards if shard.scene == scene]
         needs_points = points_name(scene) in missing
         # Shards of evaluated splits cost more, so they are spread over the jobs.
-        count = max(-(-len(in_scene) // most), int(needs_points))
+        count = -(-len(in_scene) // most)
+        count = max(min(-(-count // multiple) * multiple, len(in_scene)), int(needs_points))
         jobs += [Job(scene, tuple(in_scene[k::count]), needs_points and k == 0) for k in range(count)]
     return jobs
 

@@ -275,6 +275,19 @@ def _always_killed(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.parametrize("workers", [1, 2, 3, 64])
+@pytest.mark.parametrize("scenes", [["living_room"], ["living_room", "kitchen"]])
+def test_workers_have_equally_many_jobs(scenes, workers):
+    spec = DatasetSpec(scenes, train=1600, val=8, test=96)
+    missing = store.dataset_files(spec)
+    jobs = generation.plan(spec, missing, workers)
+    assert len(jobs) % workers == 0 or all(len(job.shards) == 1 for job in jobs)
+    assert sorted(shard.name for job in jobs for shard in job.shards) == sorted(s.name for s in spec.shards())
+    references = [sum(shard.size for shard in job.shards if shard.split != "train") for job in jobs]
+    assert max(references) - min(references) <= 8, "references are spread over the jobs"
+    assert sum(job.needs_points for job in jobs) == len(scenes)
+
+
 def test_killed_worker(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_render", _killed_once)
     monkeypatch.setattr(generation, "_announce", lambda *_: None)
