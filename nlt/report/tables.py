@@ -1,13 +1,15 @@
-"""The tables of a comparison, made from stored results: CSV, Markdown and LaTeX."""
+"""The tables of a comparison, made from stored results: CSV, Markdown and LaTeX; and what variants change."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from nlt.data.files import write_bytes
+from nlt.evaluation.claims import difference
 from nlt.evaluation.paper import COLUMNS, FLOOR, label, paper, published
 from nlt.evaluation.results import OK, Results, write_rows
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
-from nlt.report.table_writer import Table, write_texts
+from nlt.report.table_writer import Table, section, write_texts
 
 # Metrics that the paper does not report.
 _MORE = tuple(key for key in METRICS if key not in (*COLUMNS, "reference_noise"))
@@ -19,7 +21,7 @@ _BOUNDED = tuple(
 
 
 def write_tables(results: Results) -> None:
-    """Write table.csv with unrounded numbers, table.md and table.tex."""
+    """Write table.csv with unrounded numbers, table.md and table.tex; and variants.md if there are any."""
     n_test, rows = results.manifest["n_test"], []
     for method in results.methods:
         row: dict[str, Any] = {"method": method, "status": results.status(method), "n_test": n_test}
@@ -33,6 +35,8 @@ def write_tables(results: Results) -> None:
         rows.append({"method": FLOOR, "status": OK, "n_test": n_test, **results.floor})
     write_rows(results.directory / "table.csv", rows)
     write_texts(results.directory / "table", tables(results), "runs.csv, views.csv")
+    if variants := variant_table(results):
+        write_bytes(results.directory / "variants.md", "\n".join(section(variants, level=1)).encode())
 
 
 def tables(results: Results) -> list[Table]:
@@ -50,6 +54,31 @@ def tables(results: Results) -> list[Table]:
         _table(results, "95% bootstrap intervals over test views", "", bounded, _interval),
         *([_by_device(results)] if len(results.devices) > 1 else []),
     ]
+
+
+def variant_table(results: Results) -> Table | None:
+    """Return by how much each METHOD@VARIANT differs from METHOD; None if no method is there with a variant."""
+    methods = [m for m in results.methods if "@" in m and m.partition("@")[0] in results.methods]
+    keys = _measured(results, (key for key in COLUMNS if key in METRICS))
+    rows = [[_name(results, method), *(_change(results, method, key) for key in keys)] for method in methods]
+    seeds = len(results.manifest["seeds"])
+    over = f"test views and {seeds} seeds" if seeds > 1 else "test views, not over seeds, because there is only one"
+    note = (
+        "Each row compares a variant with the same method without it. Positive numbers are increases. In brackets is "
+        f"the 95% interval over {over}."
+    )
+    return Table("What each variant changes", note, [heading(key) for key in keys], rows) if rows else None
+
+
+def _change(results: Results, method: str, key: str) -> str:
+    """Return a variant's relative difference to its method, with its interval, in percent."""
+    base = method.partition("@")[0]
+    value, error = difference(results, key, method, base)
+    scale = 100 / results.mean(base, key)
+    if not math.isfinite(value * scale):
+        return "–"
+    bounds = f" [{(value - error) * scale:+.1f}, {(value + error) * scale:+.1f}]" if math.isfinite(error) else ""
+    return f"{value * scale:+.1f} %{bounds}"
 
 
 def _note(results: Results) -> str:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 from made_results import ODD, TROUBLED, make_results, make_troubled_results, papers_numbers, time_elsewhere
 from matplotlib import colormaps
@@ -146,6 +147,25 @@ def test_what_the_reference_cannot_tell_apart(tmp_path):
     for old, new in zip(before[0], markdown, strict=True):  # results without a floor are drawn as ever
         assert old == [[cell.removesuffix(" ≈") for cell in line] for line in new if line[0] != first[-1][0]]
     assert "a quarter of this MSE" in (tmp_path / "table.md").read_text()
+
+
+def test_what_variants_change(tmp_path):
+    """In percent of the method without the variant, with the interval of a paired t-test over views."""
+    rows = {"cnn": {"mse": 0.01, "mssim": 0.8}, "cnn@wide": {"mse": 0.008, "mssim": 0.82}, "nlt@wide": {"mse": 0.001}}
+    results = make_results(tmp_path, rows, None, over_views=0.1)
+    write_tables(results)
+    ((heading, row),) = markdown_tables((tmp_path / "variants.md").read_text())
+    assert heading == ["method", "MSE ↓", "MSSIM ↑"] and row[0] == "CNN only, wide", "nlt is not there to compare with"
+    for cell, key, change in zip(row[1:], ("mse", "mssim"), (-20.0, 2.5), strict=True):
+        a, b = (results.per_view(method, key) for method in ("cnn@wide", "cnn"))
+        bounds = scipy.stats.ttest_rel(a, b).confidence_interval()
+        half = 100 * (bounds.high - bounds.low) / 2 / rows["cnn"][key]
+        assert cell == f"{change:+.1f} % [{change - half:+.1f}, {change + half:+.1f}]"
+
+
+def test_no_page_of_variants_without_any(tmp_path):
+    write_tables(make_results(tmp_path, {"cnn": {"mse": 0.01}, "nlt": {"mse": 0.02}}, None))
+    assert not (tmp_path / "variants.md").exists()
 
 
 def write_and_read(results):
