@@ -52,6 +52,10 @@ done
 once nlt stress --config table2_real --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/recipe
+    once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
+        --methods cnn cnn@before nlt_photons nlt_photons@before oidn_1 oidn_4
+    room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
+        --methods cnn cnn@before feature_projection nlt nlt_photons nlt_photons@before oidn_1 oidn_4 path_tracing_1
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
     once nlt compare --config diagnosis
