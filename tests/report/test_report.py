@@ -23,7 +23,9 @@ from nlt.evaluation.paper import label, published
 from nlt.evaluation.results import load, write_manifest, write_rows
 from nlt.metrics.quantities import QUANTITIES
 from nlt.report import page as report_page
+from nlt.report import plots
 from nlt.report.claims import write_claims
+from nlt.report.figures import draw_speed_accuracy
 from nlt.report.gallery import Shown, draw_failures
 from nlt.report.packing import STEPS, max_error, pack, pack_to_fit
 from nlt.report.tables import write_tables
@@ -166,6 +168,15 @@ def test_what_variants_change(tmp_path):
 def test_no_page_of_variants_without_any(tmp_path):
     write_tables(make_results(tmp_path, {"cnn": {"mse": 0.01}, "nlt": {"mse": 0.02}}, None))
     assert not (tmp_path / "variants.md").exists()
+
+
+def test_axes_of_speed_accuracy(tmp_path, monkeypatch):
+    """Errors are logarithmic, so that a path-traced row does not press the others together; so is the time."""
+    figures = []
+    monkeypatch.setattr(plots, "save", lambda figure, *_: figures.append(figure))
+    draw_speed_accuracy(make_results(tmp_path, papers_numbers("table2"), "table2"))
+    axes = {axis.get_title(): (axis.get_xscale(), axis.get_yscale()) for axis in figures[0].axes}
+    assert axes["MSE ↓"] == axes["FID ↓"] == ("log", "log") and axes["MSSIM ↑"] == ("log", "linear")
 
 
 def write_and_read(results):
