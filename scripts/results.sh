@@ -52,10 +52,16 @@ done
 once nlt stress --config table2_real --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/recipe
+    once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/narrow \
+        --methods cnn cnn@narrow nlt_photons nlt_photons@narrow guided_1_1 guided_1_1@narrow oidn_1 oidn_4
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
-        --methods cnn cnn@before nlt_photons nlt_photons@before oidn_1 oidn_4
+        --methods cnn cnn@before cnn@images_6400 nlt_photons nlt_photons@before photons_only@images_6400 oidn_1 oidn_4
     room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
-        --methods cnn cnn@before feature_projection nlt nlt_photons nlt_photons@before oidn_1 oidn_4 path_tracing_1
+        --methods nlt_photons cnn cnn@before oidn_1 oidn_4 path_tracing_1
+    for lights in moving fixed; do
+        once nlt compare --config front --scale any_room --data "real_living_room_${lights}_lights" --workers "${WORKERS:-2}" \
+            --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1 --out "results/any_room_$lights"
+    done
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
     once nlt compare --config diagnosis
