@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from nlt import __version__
 from nlt.errors import UserError, to_user_error
+from nlt.paths import is_checkpoint
 from nlt.waiting import wait_passively
 
 _LIGHTNING = {
@@ -20,6 +21,8 @@ _LIGHTNING = {
 # Help texts of several commands.
 _IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
+# The experiments of --lights.
+_EXPERIMENTS: dict[str | None, Any] = {"own": "fixed_lights", "moving": "moving_lights", None: None}
 _SCENE = "description in configs/scenes or in your ./scenes, by name or path"
 
 
@@ -139,17 +142,28 @@ def _draw(directory: str | Path, megabytes: int | None = None) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    if options.demo == bool(options.checkpoint) or (options.checkpoint and not options.scene):
-        raise UserError("give either CKPT and SCENE or --demo; see nlt render --help")
+    source, scene = options.source, options.scene
+    if options.demo == bool(source) or (source and not scene and is_checkpoint(source)):
+        raise UserError("give SCENE, CKPT and SCENE, or --demo; see nlt render --help")
     from nlt.evaluation.render import DEMO, DEMO_SCENE, render
 
-    demo = options.demo
+    checkpoints: dict[str, str] = {}
+    state, light, lights = options.state, options.light, options.lights
+    if options.demo:
+        checkpoints, scene = DEMO, DEMO_SCENE
+        light = light or ("turntable" if lights != "own" and (state or "0").isdecimal() else None)
+    elif scene:
+        checkpoints = {"": source}
+    else:
+        scene, state = source, state or "rest"
+        lights = lights or ("moving" if light else "own")
     render(
-        checkpoints=DEMO if demo else {"": options.checkpoint},
-        scene=DEMO_SCENE if demo else options.scene,
+        checkpoints=checkpoints,
+        scene=scene,
         output=options.output,
-        state=options.state,
-        light=options.light or ("turntable" if demo and options.state.isdecimal() else None),
+        state=state or "0",
+        light=light,
+        experiment=_EXPERIMENTS[lights],
         camera_path=options.camera_path,
         frames=options.frames,
         resolution=options.resolution,
@@ -163,10 +177,11 @@ def _render(options: argparse.Namespace) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     if options.demo == bool(options.source):
-        raise UserError("give either CKPT or RESULTS, or --demo; see nlt view --help")
+        raise UserError("give SCENE, CKPT, RESULTS or --demo; see nlt view --help")
     from nlt.view.page import view
 
-    view(options.source, options.scene, options.host, options.port, options.resolution)
+    experiment = _EXPERIMENTS[options.lights]
+    view(options.source, options.scene, options.host, options.port, options.resolution, experiment)
 
 
 def _scenes(options: argparse.Namespace) -> None:
@@ -288,10 +303,16 @@ def _add_scheduler(parser: argparse.ArgumentParser, workers: str) -> None:
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("checkpoint", nargs="?", metavar="CKPT", help="checkpoint, or NAME.safetensors from nlt export")
+    parser.add_argument(
+        "source", nargs="?", metavar="CKPT",
+        help="checkpoint, or NAME.safetensors from nlt export (default: Open Image Denoise)",
+    )  # fmt: skip
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=_SCENE)
-    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt and move the light")
-    parser.add_argument("--state", default="0", help="index of a random state, or a YAML file (default: 0)")
+    parser.add_argument("--demo", action="store_true", help="use the two included models of one room; its light moves")
+    parser.add_argument(
+        "--state", help="rest, index of a random state, or a YAML file (default: 0; without CKPT, rest)"
+    )
+    _add_lights(parser)
     parser.add_argument("--light", choices=("turntable",), help="move the light around (default: as in --state)")
     parser.add_argument(
         "--camera-path", default="turntable", help="turntable, or a YAML or JSON file with views (default: turntable)"
@@ -308,13 +329,22 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exr", action="store_true", help="also write each frame as a multi-layer EXR into the folder")
 
 
+def _add_lights(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--lights", choices=("own", "moving"),
+        help="the scene's own lights, or the moving light alone (default: as in training; without CKPT, own)",
+    )  # fmt: skip
+
+
 def _add_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", nargs="?", metavar="CKPT|RESULTS",
-        help="checkpoint, NAME.safetensors from nlt export, or results directory of nlt compare",
+        help="checkpoint, NAME.safetensors from nlt export, or results directory of nlt compare (default: Open "
+        "Image Denoise and path tracing)",
     )  # fmt: skip
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=f"{_SCENE} (default: the first of the training)")
-    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt")
+    parser.add_argument("--demo", action="store_true", help="use the two included models of one room; its light moves")
+    _add_lights(parser)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine)")
     parser.add_argument(
         "--port", type=_whole, default=8080, help="port to listen at; 0 takes a free one (default: 8080)"

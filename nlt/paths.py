@@ -10,6 +10,11 @@ CONFIGS = next(folder for folder in (Path(__file__).with_name("configs"), PROJEC
 OWN_SCENES = Path("scenes")
 
 
+def is_checkpoint(argument: str) -> bool:
+    """Return whether an argument of the command line names a checkpoint, not a scene."""
+    return Path(argument).suffix in {".ckpt", ".safetensors"}
+
+
 def scenes_root() -> Path:
     """Return the folder of downloaded scenes: `NLT_SCENES`, else `shared/scenes` in the project's parent folder."""
     return Path(os.environ.get("NLT_SCENES", PROJECT.parent / "shared" / "scenes"))

@@ -20,7 +20,6 @@ fixed_lights() {
 }
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
-any_room="guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1"
 front="cnn feature_projection nlt nlt_photons guided_1spp guided_1spp_relative
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
@@ -59,8 +58,8 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@before cnn@images_6400 nlt_photons nlt_photons@before photons_only@images_6400 oidn_1 oidn_4
     room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
         --methods nlt_photons cnn cnn@before oidn_1 oidn_4 path_tracing_1
-    room --config front --scale any_room --methods $any_room --out results/any_room
-    fixed_lights --config front --scale any_room --methods $any_room --out results/any_room_fixed_lights
+    room --config front --scale any_room --out results/any_room \
+        --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
     once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py --minutes 20
     once nlt compare --config diagnosis

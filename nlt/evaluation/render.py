@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from tqdm import tqdm
 
+from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.data.dataset import SampleTensors, collate
 from nlt.data.files import remove_leftovers, write_bytes
 from nlt.data.render import SampleRenderer
@@ -31,7 +32,7 @@ from nlt.display import display
 from nlt.errors import UserError
 from nlt.evaluation.export import load_trained
 from nlt.evaluation.provenance import origin, surroundings
-from nlt.models.method import Batch
+from nlt.models.method import Batch, Method
 from nlt.models.module import RenderingModule
 from nlt.models.moving_camera import MovingCamera
 from nlt.models.policy import Policy, accelerate, default_device
@@ -39,17 +40,19 @@ from nlt.models.steady import Steady
 from nlt.paths import find_config
 from nlt.rendering.exr import exr
 from nlt.scenes.camera import Camera
-from nlt.scenes.description import load_description
+from nlt.scenes.description import Experiment, load_description
 from nlt.scenes.state import SceneState
 from nlt.scenes.trajectory import cameras, states
 
-_PRETRAINED = Path(__file__).with_name("pretrained")
+PRETRAINED = Path(__file__).with_name("pretrained")
 # The models that come with nlt, by the name that is shown; the first is the better one.
 DEMO = {
-    "Guided (1 spp)": str(_PRETRAINED / "guided_1spp.safetensors"),
-    "the paper's full model": str(_PRETRAINED / "nlt_photons.safetensors"),
+    "Guided (1 spp)": str(PRETRAINED / "guided_1spp.safetensors"),
+    "the paper's full model": str(PRETRAINED / "nlt_photons.safetensors"),
 }
 DEMO_SCENE = "living_room"
+# What draws a scene in which nothing was trained. No included model is as good there (docs/results.md).
+UNTRAINED = "Open Image Denoise (1 spp, fast)"
 MANIFEST = "render.json"
 _MODEL, _TRACED = 0, 1  # seeds of photons and of path tracing
 _WARM, _TIMED = 2, 5  # frames; the warm-up compiles kernels
@@ -71,7 +74,7 @@ class ModelRenderer:
 
     def __init__(
         self,
-        method: RenderingModule,
+        method: Method,
         spec: DatasetSpec,
         scene: int,
         device: torch.device,
@@ -82,7 +85,7 @@ class ModelRenderer:
         self.render = render or SampleRenderer(spec, scene)
         self.method = method.to(device).eval()
         self.seconds: dict[str, float] = {}
-        self.moving = MovingCamera(self.method, self.stage)
+        self.moving = MovingCamera(self.method, self.stage) if isinstance(self.method, RenderingModule) else None
         self._seeds = np.random.SeedSequence([_MODEL])  # of all that has the same seed in every frame
         self._state: dict[str, np.ndarray] = {}
         self._key: bytes | None = None
@@ -91,7 +94,7 @@ class ModelRenderer:
         if any(name.startswith("point_") for name in method.fields):
             clouds[scene] = points or self.render.points()
             self._state_fields |= {"translation", "present"}
-        fields = {*method.fields} - {"view_direction"}  # `batch` computes it, at any resolution
+        fields = {*method.fields} - {"view_direction", "traced"}  # `batch` computes them
         self._tensors = SampleTensors(spec, clouds, fields)
 
     def batch(self, state: SceneState, camera: Camera, number: int = 0) -> Batch:
@@ -113,6 +116,8 @@ class ModelRenderer:
         tensors = self._tensors(self.scene, self._state | view, number)
         tensors["view_direction"] = torch.from_numpy(camera.view_directions())
         batch = {name: value.to(self.device) for name, value in collate([tensors]).items()}
+        if "traced" in names:
+            batch["traced"] = self.traced(state, camera, self.method.spp or 1, number).to(self.device)
         if sparse:
             (name,) = {*self.method.fields} & {*TRACED}
             batch[name] = self._trace_input_pixels(batch, camera, seeds)
@@ -135,7 +140,11 @@ class ModelRenderer:
     def frame(self, state: SceneState, camera: Camera, number: int = 0) -> Tensor:
         """Return the method's radiance (1, 3, H, W)."""
         batch = self.batch(state, camera, number)
-        image = self.moving(self.method.subsample(batch))
+        if self.moving:
+            image = self.moving(self.method.subsample(batch))
+        else:
+            with self.stage("denoise"):
+                image = self.method(batch)
         return self.steady(image, batch) if self.steady else image
 
     def traced(self, state: SceneState, camera: Camera, spp: int, frame: int) -> Tensor:
@@ -167,6 +176,7 @@ def render(
     output: str,
     state: str = "0",
     light: str | None = None,
+    experiment: Experiment | None = None,
     camera_path: str = "turntable",
     frames: int = 36,
     resolution: tuple[int, int] = (256, 256),
@@ -182,11 +192,13 @@ def render(
 
     Args:
         checkpoints: checkpoints of `nlt fit` in their runs, or safetensors of `nlt export`, by the names shown; all of
-            one experiment. An empty name stands for the name of the method's class.
+            one experiment. An empty name stands for the name of the method's class. Without any, Open Image Denoise
+            draws the scene.
         scene: a scene of the methods' datasets; any scene for methods without point embeddings.
         output: VIDEO.mp4, next to which VIDEO.png, the first frame, and VIDEO.json, the manifest, are written; or a
             folder for PNGs.
         state, light, camera_path: see nlt/scenes/trajectory.py.
+        experiment: see `load_models`.
         resolution: width and height of each image.
         spp: samples per pixel of path tracing; None for as many as the time of the slowest method allows, 0 for none.
         photons: number of photons to cast (default: as in the dataset).
@@ -202,7 +214,7 @@ def render(
     if video and layers:
         raise UserError(f"--exr: -o must be a folder, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
-    loaded = load_models(checkpoints, scene, photons)
+    loaded = load_models(checkpoints, scene, photons, experiment) if checkpoints else load_untrained(scene, experiment)
     *_, spec, index = next(iter(loaded.values()))
     description = spec.descriptions[index]
     views = cameras(description, camera_path, frames, *resolution)
@@ -264,17 +276,21 @@ def render(
 
 
 class Loaded(NamedTuple):
-    """A trained method, and the scene that it will draw: number `scene` in `spec`, with the points of training."""
+    """A method, and the scene that it will draw: number `scene` in `spec`, with the points of training, if any."""
 
     checkpoint: str
-    method: RenderingModule
+    method: Method
     points: Points | None
     spec: DatasetSpec
     scene: int
 
 
-def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int | None = None) -> dict[str, Loaded]:
+def load_models(
+    checkpoints: Mapping[str, str], scene: str | None, photons: int | None = None, experiment: Experiment | None = None
+) -> dict[str, Loaded]:
     """Load what `open_models` opens, for `scene`, or for the first one of the first training; see `render`.
+
+    `experiment` is that of the picture, by default of the training: "fixed_lights" shows the scene's own lights.
 
     Raises:
         UserError: a file is missing or wrong, or the scene does not suit a method.
@@ -282,9 +298,16 @@ def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int 
     loaded = {}
     for name, checkpoint in checkpoints.items():
         method, spec, points = load_trained(checkpoint)
+        if experiment and experiment != spec.experiment and method.has_point_embeddings:
+            raise UserError(
+                f"--lights: {checkpoint} has point embeddings, which were trained in the experiment {spec.experiment}; "
+                "omit the option"
+            )
         scene = scene or spec.scenes[0]
         spec, index = with_scene(method, spec, scene, checkpoint)
-        spec = dataclasses.replace(spec, num_photons=photons or spec.num_photons)
+        spec = dataclasses.replace(
+            spec, num_photons=photons or spec.num_photons, experiment=experiment or spec.experiment
+        )
         own = points[index] if method.has_point_embeddings and points else None
         if method.has_point_embeddings and not own:
             raise UserError(
@@ -293,6 +316,17 @@ def load_models(checkpoints: Mapping[str, str], scene: str | None, photons: int 
             )
         loaded[name or type(method).__name__] = Loaded(checkpoint, method, own, spec, index)
     return loaded
+
+
+def load_untrained(scene: str, experiment: Experiment | None = None) -> dict[str, Loaded]:
+    """Return Open Image Denoise for a scene, by its own lights unless the experiment says otherwise.
+
+    Raises:
+        UserError: the scene is unknown, or lacks what the experiment needs.
+    """
+    spec = DatasetSpec([scene], experiment or "fixed_lights")
+    spec.descriptions[0].movables(spec.experiment)  # raises UserError
+    return {UNTRAINED: Loaded("", OpenImageDenoise(1, "fast"), None, spec, 0)}
 
 
 def open_models(loaded: Mapping[str, Loaded]) -> dict[str, ModelRenderer]:

@@ -15,7 +15,7 @@ from nlt.scenes.camera import Camera
 from nlt.scenes.description import MOVING_LIGHT, FieldOfView, Point, SceneDescription
 from nlt.scenes.state import SceneState, rest_state, sample_state
 
-TURNTABLE = "turntable"
+TURNTABLE, REST = "turntable", "rest"
 _INNER = 0.9  # radius of a turntable, as a fraction of the box's half size
 
 
@@ -92,16 +92,16 @@ def states(
     """Return the states of a video, in which only the light moves.
 
     Args:
-        state: the seed of a random state; or a YAML file with `seed`, the random state to start from (default: every
-            object at rest), `objects`, each either "removed" or a translation from rest, and `light`, the keyframes
-            of the light's centre. Lengths are in metres.
+        state: "rest", where every object is at rest; the seed of a random state; or a YAML file with `seed`, the random
+            state to start from (default: rest), `objects`, each either "removed" or a translation from rest, and
+            `light`, the keyframes of the light's centre. Lengths are in metres.
         light: "turntable" to circle in the box of the light's positions; None to follow the file's `light`, if any.
 
     Raises:
         UserError: the file is missing, or does not describe a state of this scene and experiment.
     """
-    if state.isdecimal():
-        read = _State(seed=int(state))
+    if state == REST or state.isdecimal():
+        read = _State(seed=None if state == REST else int(state))
     else:
         read = parse(_State, {k: v for k, v in read_configs([Path(state).absolute()]).items() if v is not None}, state)
     if read.seed is None:

@@ -19,7 +19,7 @@ from nlt.errors import UserError
 from nlt.evaluation.render import shown
 from nlt.rendering.exr import exr
 from nlt.scenes.camera import Camera
-from nlt.scenes.description import Movable
+from nlt.scenes.description import Experiment, Movable
 from nlt.scenes.state import SceneState, rest_state
 from nlt.scenes.trajectory import TURNTABLE, cameras, write_camera, write_state
 from nlt.view.pace import Pace, size
@@ -32,7 +32,9 @@ _ENOUGH = 1 << 14  # samples per pixel at which the reference stops
 _ALL, _NONE = "all", "none"
 
 
-def view(source: str | None, scene: str | None, host: str, port: int, resolution: int) -> None:
+def view(
+    source: str | None, scene: str | None, host: str, port: int, resolution: int, experiment: Experiment | None = None
+) -> None:
     """Show a scene in the browser until the page's button or Ctrl-C ends it; arguments as in `nlt view --help`.
 
     Raises:
@@ -42,7 +44,7 @@ def view(source: str | None, scene: str | None, host: str, port: int, resolution
         socket.create_server((host, port)).close()  # viser would silently take another port
     except OSError as error:
         raise UserError(f"--host, --port: {host}:{port}: {error.strerror}; give another address") from None
-    page = Page(Pictures(source, scene), host, port, resolution)
+    page = Page(Pictures(source, scene, experiment), host, port, resolution)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: page.close())
     print(f"nlt view: http://{host}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)

@@ -8,9 +8,11 @@ from torch import Tensor
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
-from nlt.evaluation.render import DEMO, load_models, open_models
+from nlt.evaluation.render import DEMO, load_models, load_untrained, open_models
 from nlt.evaluation.results import MANIFEST, OK, RUNS, load
+from nlt.paths import is_checkpoint
 from nlt.scenes.camera import Camera
+from nlt.scenes.description import Experiment
 from nlt.scenes.state import SceneState
 
 DENOISED, TRACED, REFERENCE = "Open Image Denoise", "path tracing", "reference (accumulates)"
@@ -19,16 +21,27 @@ DENOISED, TRACED, REFERENCE = "Open Image Denoise", "path tracing", "reference (
 class Pictures:
     """Draws one scene by any of `names`. All of it must run in one thread, because Mitsuba and PyTorch do."""
 
-    def __init__(self, source: str | None, scene: str | None) -> None:
-        """Load a checkpoint, or the first training of each method in a results directory; None loads the demo's models.
+    def __init__(self, source: str | None, scene: str | None = None, experiment: Experiment | None = None) -> None:
+        """Load the models of a source for a scene, and open the scene.
+
+        Args:
+            source: a checkpoint; a results directory, for the first training of each method; a scene, in which nothing
+                was trained; or None, for the demo's models.
+            scene: see `load_models`; None if the source is a scene.
+            experiment: see `load_models`; by default that of training, or fixed_lights if the source is a scene.
 
         Raises:
             UserError: a file is missing or wrong, or the scene does not suit a method.
         """
-        self._models = open_models(load_models(find_checkpoints(source), scene))
+        untrained = source and not scene and not is_checkpoint(source) and not Path(source).is_dir()
+        if source and untrained:
+            loaded = load_untrained(source, experiment)
+        else:
+            loaded = load_models(find_checkpoints(source), scene, experiment=experiment)
+        self._models = open_models(loaded)
         self._any = next(iter(self._models.values()))
         self.scene = self._any.render.scene
-        self.names = [*self._models, DENOISED, TRACED, REFERENCE]
+        self.names = [*({} if untrained else self._models), DENOISED, TRACED, REFERENCE]
 
     @torch.no_grad()
     def draw(self, name: str, state: SceneState, camera: Camera, spp: int, frame: int = 0) -> Tensor:

@@ -17,6 +17,7 @@ from tiny import write
 
 from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.guided import GuidedOneSample
+from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.baselines.photon_splat import PhotonSplat
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
@@ -27,6 +28,7 @@ from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.render import (
     DEMO,
     DEMO_SCENE,
+    UNTRAINED,
     ModelRenderer,
     load_models,
     open_models,
@@ -39,7 +41,7 @@ from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy, accelerate
 from nlt.models.steady import Steady
 from nlt.rendering.renderer import Renderer
-from nlt.scenes.state import sample_state
+from nlt.scenes.state import rest_state, sample_state
 from nlt.scenes.trajectory import cameras, follow, states, turn, write_camera, write_state
 
 pytest_plugins = ["training_fixtures"]
@@ -300,29 +302,59 @@ def test_video_shows_its_frames(tmp_path):
         assert errors[k] < 5 and int(np.argmin(errors)) == k
 
 
-def test_demo(tmp_path):
-    """The models that come with nlt are small, say where they are from, and are nearer to the reference than 1 spp."""
-    assert sum(Path(file).stat().st_size for file in DEMO.values()) <= 5e6
-    for file in DEMO.values():
-        card = json.loads(Path(file).with_suffix(".json").read_text())
+def test_included_models():
+    """They are small and say where they are from."""
+    files = [Path(file) for file in DEMO.values()]
+    assert sum(file.stat().st_size for file in files) <= 5e6
+    for file in files:
+        card = json.loads(file.with_suffix(".json").read_text())
         assert card["command"] and len(card["commit"]) == 40 and card["test"]["mse"] > 0 and card["minutes"] > 0
-        assert card["sha256"] == hashlib.sha256(Path(file).read_bytes()).hexdigest()
+        assert card["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def test_demo(tmp_path):
+    """The demo's models are nearer to the reference than 1 spp."""
     assert main(["render", "--demo", "--frames", "2", "--resolution", "32", "-o", "demo.mp4"]) == 0
     assert pixels(tmp_path / "demo.png").shape == (52, 96, 3) and (tmp_path / "demo.mp4").stat().st_size > 0
     assert list(json.loads((tmp_path / "demo.json").read_text())["model_ms"]) == list(DEMO)
     models = open_models(load_models(DEMO, DEMO_SCENE))
     first = next(iter(models.values()))
-    errors = []
     description = first.render.description
     moments = states(description, "moving_lights", "5", "turntable", 4)
+    errors = []
     for moment, view in zip(moments, cameras(description, "turntable", 4, 64, 64), strict=True):
         with torch.no_grad():
             images = [first.traced(moment, view, spp, 1) for spp in (64, 1)]
             images += [model.frame(moment, view) for model in models.values()]
-        reference, *shown = [display(image, 1.0) for image in images]
-        errors.append([(image - reference).square().mean().item() for image in shown])
+        reference, *drawn = [display(image, 1.0) for image in images]
+        errors.append([(image - reference).square().mean().item() for image in drawn])
     noisy, *ours = np.mean(errors, axis=0)
     assert max(ours) < 0.5 * noisy
+
+
+def test_without_training(tmp_path):
+    """Without a checkpoint, Open Image Denoise draws a scene as it is, by its own lights unless the light is moved."""
+    command = ["render", "egg", "--frames", "1", "--resolution", "16"]
+    variants = {"own": "", "turning": "--light turntable", "moving": "--lights moving", "moved": "--state 3"}
+    for name, options in variants.items():
+        assert main([*command, *options.split(), "--spp", "1", "-o", name]) == 0
+    manifests = {name: json.loads(Path(name, "render.json").read_text()) for name in variants}
+    assert {name: each["experiment"] for name, each in manifests.items()} == {
+        "own": "fixed_lights", "turning": "moving_lights", "moving": "moving_lights", "moved": "fixed_lights"
+    }  # fmt: skip
+    assert all(list(each["model_ms"]) == [UNTRAINED] for each in manifests.values())
+    assert len({pixels(tmp_path / name / "00000.png").tobytes() for name in variants}) == 4
+    renderer = SampleRenderer(spec_of("egg", experiment="fixed_lights"), 0)
+    description = renderer.description
+    renderer.scene.set_state(rest_state(description, "fixed_lights"))
+    (view,) = cameras(description, "turntable", 1, 16, 16)
+    (seed,) = np.random.SeedSequence([1, 0]).generate_state(1)
+    traced = renderer.radiance(view, 1, int(seed))
+    guides = renderer.view(view, np.random.SeedSequence([0]), {"albedo", "normal"})
+    batch = {name: torch.from_numpy(value)[None] for name, value in {**guides, "traced": traced}.items()}
+    denoised = OpenImageDenoise(1, "fast")(batch | {"exposure": torch.tensor([description.exposure])})[0].numpy()
+    expected = np.concatenate([shown(image, description.exposure) for image in (denoised, traced)], axis=1)
+    np.testing.assert_array_equal(pixels(tmp_path / "own/00000.png")[:16], expected)
 
 
 # --- paths ---
@@ -404,6 +436,8 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     save_trained(method, spec_of(), [], "without.safetensors")
     refused(["render", "without.safetensors", "living_room"], "without.safetensors", "not the points", "train again")
     refused(["render", models.splat], "CKPT and SCENE")
+    refused(["render", "palace"], "palace", "known scenes")
+    refused(["render", models.nlt, "living_room", "--lights", "own"], "--lights", "embeddings", "moving_lights")
     refused(["render", "--demo", models.splat, "living_room"], "CKPT and SCENE")
     refused([*plain, "-o", "video.avi"], "video.avi")
     refused([*plain, "--spp", "many"], "--spp")

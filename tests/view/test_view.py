@@ -15,11 +15,13 @@ import pytest
 import torch
 from PIL import Image
 
+from nlt.errors import UserError
 from nlt.evaluation.render import DEMO, load_models, open_models, shown
 from nlt.evaluation.results import write_manifest, write_rows
+from nlt.scenes.state import rest_state
 from nlt.scenes.trajectory import cameras, states
 from nlt.view.page import clamp
-from nlt.view.pictures import TRACED
+from nlt.view.pictures import DENOISED, REFERENCE, TRACED, Pictures
 
 pytestmark = pytest.mark.slow
 FINEST = 64  # --resolution
@@ -239,6 +241,20 @@ def test_saves_what_it_shows_and_quits(open_page, model, process):
     np.testing.assert_allclose(layers["Depth.Z"], model.gbuffer(state, camera)["depth"][0], rtol=1e-4)
     page.page.get_by_role("button", name="quit", exact=True).click()
     assert ends_cleanly(process)
+
+
+def test_without_training():
+    """A scene in place of a checkpoint is shown as it is, by its own lights unless told otherwise."""
+    own, moving = Pictures("egg"), Pictures("egg", experiment="moving_lights")
+    assert own.names == moving.names == [DENOISED, TRACED, REFERENCE]
+    assert [pictures.scene.experiment for pictures in (own, moving)] == ["fixed_lights", "moving_lights"]
+    description = own.scene.description
+    (view,) = cameras(description, "turntable", 1, 16, 16)
+    images = [own.draw(name, rest_state(description, "fixed_lights"), view, 4) for name in own.names]
+    assert all(image.shape == (3, 16, 16) and image.isfinite().all() for image in images)
+    assert (images[0] != images[1]).any() and {"gbuffer", "path_tracing", "denoise"} == {*own.lap()}
+    with pytest.raises(UserError, match=r"palace.*known scenes"):
+        Pictures("palace")
 
 
 def test_interrupted():
