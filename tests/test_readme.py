@@ -62,6 +62,7 @@ ELSEWHERE = {
     "nlt compare --config demo --data room": "test_compare.py::test_table",
     "nlt select --config demo --minutes 6": "test_select.py::test_end_to_end",
     "nlt render --demo": "test_render.py::test_demo",
+    "nlt view room": "test_view.py::test_without_training",
     "nlt view --demo": "test_view.py::test_light_method_and_second_client",
 }
 
