@@ -22,7 +22,7 @@ _LIGHTNING = {
 _IMAGE = "image file to write (default: {})"
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf")
 # The experiments of --lights.
-_EXPERIMENTS: dict[str | None, Any] = {"own": "fixed_lights", "moving": "moving_lights", None: None}
+_EXPERIMENTS: dict[str, Any] = {"own": "fixed_lights", "moving": "moving_lights"}
 _SCENE = "description in configs/scenes or in your ./scenes, by name or path"
 
 
@@ -156,14 +156,14 @@ def _render(options: argparse.Namespace) -> None:
         checkpoints = {"": source}
     else:
         scene, state = source, state or "rest"
-        lights = lights or ("moving" if light else "own")
+        lights = lights or ("moving" if light else None)
     render(
         checkpoints=checkpoints,
         scene=scene,
         output=options.output,
         state=state or "0",
         light=light,
-        experiment=_EXPERIMENTS[lights],
+        experiment=_EXPERIMENTS.get(lights),
         camera_path=options.camera_path,
         frames=options.frames,
         resolution=options.resolution,
@@ -180,7 +180,7 @@ def _view(options: argparse.Namespace) -> None:
         raise UserError("give SCENE, CKPT, RESULTS or --demo; see nlt view --help")
     from nlt.view.page import view
 
-    experiment = _EXPERIMENTS[options.lights]
+    experiment = _EXPERIMENTS.get(options.lights)
     view(options.source, options.scene, options.host, options.port, options.resolution, experiment)
 
 
@@ -308,7 +308,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         help="checkpoint, or NAME.safetensors from nlt export (default: Open Image Denoise)",
     )  # fmt: skip
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=_SCENE)
-    parser.add_argument("--demo", action="store_true", help="use the two included models of one room; its light moves")
+    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt and move the light")
     parser.add_argument(
         "--state", help="rest, index of a random state, or a YAML file (default: 0; without CKPT, rest)"
     )
@@ -331,7 +331,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
 
 def _add_lights(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--lights", choices=("own", "moving"),
+        "--lights", choices=tuple(_EXPERIMENTS),
         help="the scene's own lights, or the moving light alone (default: as in training; without CKPT, own)",
     )  # fmt: skip
 
@@ -343,7 +343,7 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
         "Image Denoise and path tracing)",
     )  # fmt: skip
     parser.add_argument("scene", nargs="?", metavar="SCENE", help=f"{_SCENE} (default: the first of the training)")
-    parser.add_argument("--demo", action="store_true", help="use the two included models of one room; its light moves")
+    parser.add_argument("--demo", action="store_true", help="use the two models that come with nlt")
     _add_lights(parser)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine)")
     parser.add_argument(

@@ -1,8 +1,12 @@
-"""Make a model that comes with nlt from a finished comparison: safetensors, and a card of its origin and metrics.
+"""Make a model of `nlt render --demo` from a finished training: safetensors, and a card of its origin and metrics.
 
-nlt compare --config front --scale pretrained --data demo --methods guided_1spp nlt_photons --out runs/pretrained
-python scripts/pretrained.py runs/pretrained guided_1spp
-python scripts/pretrained.py runs/pretrained nlt_photons
+    nlt generate --config data/demo --config scale/pretrained
+    for METHOD in guided_1spp nlt_photons; do
+        nlt fit --config data/demo --config model/$METHOD --config scale/pretrained \
+            --trainer.default_root_dir runs/pretrained/$METHOD
+        python scripts/pretrained.py runs/pretrained/$METHOD/lightning_logs/version_0/checkpoints/*.ckpt \
+            $(git rev-parse HEAD)
+    done
 """
 
 import dataclasses
@@ -11,41 +15,44 @@ import json
 import sys
 from pathlib import Path
 
+from nlt.config import read_configs
 from nlt.data.files import write_bytes
 from nlt.evaluation.export import load_trained, save_trained
-from nlt.evaluation.render import PRETRAINED
-from nlt.evaluation.results import load
-from nlt.evaluation.trainings import newest_checkpoint
-from nlt.metrics.quantities import METRICS
+from nlt.evaluation.provenance import origin, surroundings
+from nlt.evaluation.render import DEMO
+from nlt.models.factory import read_checkpoint
+from nlt.models.policy import default_device
+from nlt.training import run_lightning
 
-_ORIGIN = ("commit", "uncommitted_changes", "started", "device", "platform", "python", "versions", "mitsuba_variant")
 
-
-def main(directory: str, method: str) -> None:
-    """Write the first training of a method in a results directory into the package, by its name."""
-    results = load(directory)
-    run = results.runs_of(method)[0]
-    checkpoint = newest_checkpoint(Path(run["run"]))
-    trained, spec, points = load_trained(str(checkpoint))
-    file = PRETRAINED / f"{method}.safetensors"
-    save_trained(trained, spec, points, str(file))
-    model = results.manifest["configs"][method]
+def main(checkpoint: str, commit: str) -> None:
+    """Evaluate a checkpoint that was trained at `commit` and write it to where `nlt render --demo` finds it."""
+    run_folder = Path(checkpoint).absolute().parents[1]
+    name = run_folder.parents[1].name
+    (file,) = (Path(path) for path in DEMO.values() if Path(path).stem == name)
+    used = ("data/demo", f"model/{name}", "scale/pretrained")
+    begun, configs = origin(), [f"--config={config}" for config in used]
+    run = read_configs([str(run_folder / "config.yaml")])
+    seconds = Path(checkpoint).stat().st_mtime - (run_folder / "config.yaml").stat().st_mtime
+    trainer = run_lightning(["test", *configs, f"--ckpt_path={checkpoint}", "--trainer.logger=false"]).trainer
+    method, spec, points = load_trained(checkpoint)
+    save_trained(method, spec, points, str(file))
     card = {
-        "command": results.manifest["command"],
-        **{name: results.manifest[name] for name in _ORIGIN},
-        "trained_at_commit": run["trained_at_commit"],
-        "minutes": round(run["train_s"] / 60, 1),
-        "threads": run["threads"],
-        "seed": run["seed"],
-        "model": model["model"],
-        "batch_size": model["data"]["batch_size"],
-        "precision": model["trainer"].get("precision"),
-        "steps": run["steps"],
+        **begun,
+        "command": f"python scripts/pretrained.py {Path(checkpoint).name} {commit}",
+        "training_command": "nlt fit " + " ".join(f"--config {config}" for config in used),
+        "trained_at_commit": commit,
+        "minutes": round(seconds / 60, 1),
+        **{name: value for name, value in surroundings(default_device()).items() if name != "clock"},
+        "seed": run["seed_everything"],
+        "model": run["model"],
+        "batch_size": run["data"]["batch_size"],
+        "precision": run["trainer"]["precision"],
+        "steps": read_checkpoint(checkpoint)["global_step"],
         "dataset": dataclasses.asdict(spec),
-        "parameters": run["parameters"],
+        "parameters": sum(p.numel() for p in method.parameters()),
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        "tested_in": results.manifest["dataset"],
-        "test": {name: run[name] for name in METRICS if name in run},
+        "test": {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()},
     }
     write_bytes(file.with_suffix(".json"), (json.dumps(card, indent=1) + "\n").encode())
 

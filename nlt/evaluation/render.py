@@ -44,11 +44,11 @@ from nlt.scenes.description import Experiment, load_description
 from nlt.scenes.state import SceneState
 from nlt.scenes.trajectory import cameras, states
 
-PRETRAINED = Path(__file__).with_name("pretrained")
+_PRETRAINED = Path(__file__).with_name("pretrained")
 # The models that come with nlt, by the name that is shown; the first is the better one.
 DEMO = {
-    "Guided (1 spp)": str(PRETRAINED / "guided_1spp.safetensors"),
-    "the paper's full model": str(PRETRAINED / "nlt_photons.safetensors"),
+    "Guided (1 spp)": str(_PRETRAINED / "guided_1spp.safetensors"),
+    "the paper's full model": str(_PRETRAINED / "nlt_photons.safetensors"),
 }
 DEMO_SCENE = "living_room"
 # What draws a scene in which nothing was trained. No included model is as good there (docs/results.md).
@@ -214,7 +214,7 @@ def render(
     if video and layers:
         raise UserError(f"--exr: -o must be a folder, is {output!r}")
     folder = Path(output).with_suffix(".frames") if video else Path(output)
-    loaded = load_models(checkpoints, scene, photons, experiment) if checkpoints else load_untrained(scene, experiment)
+    loaded = load_models(checkpoints, scene, photons, experiment)
     *_, spec, index = next(iter(loaded.values()))
     description = spec.descriptions[index]
     views = cameras(description, camera_path, frames, *resolution)
@@ -290,11 +290,15 @@ def load_models(
 ) -> dict[str, Loaded]:
     """Load what `open_models` opens, for `scene`, or for the first one of the first training; see `render`.
 
-    `experiment` is that of the picture, by default of the training: "fixed_lights" shows the scene's own lights.
+    `experiment` is that of the picture: "fixed_lights" shows the scene's own lights. By default it is that of the
+    training. Without checkpoints, Open Image Denoise draws the scene, by default under its own lights.
 
     Raises:
         UserError: a file is missing or wrong, or the scene does not suit a method.
     """
+    if scene and not checkpoints:
+        spec = DatasetSpec([scene], experiment or "fixed_lights")
+        return {UNTRAINED: Loaded("", OpenImageDenoise(1, "fast"), None, spec, 0)}
     loaded = {}
     for name, checkpoint in checkpoints.items():
         method, spec, points = load_trained(checkpoint)
@@ -316,17 +320,6 @@ def load_models(
             )
         loaded[name or type(method).__name__] = Loaded(checkpoint, method, own, spec, index)
     return loaded
-
-
-def load_untrained(scene: str, experiment: Experiment | None = None) -> dict[str, Loaded]:
-    """Return Open Image Denoise for a scene, by its own lights unless the experiment says otherwise.
-
-    Raises:
-        UserError: the scene is unknown, or lacks what the experiment needs.
-    """
-    spec = DatasetSpec([scene], experiment or "fixed_lights")
-    spec.descriptions[0].movables(spec.experiment)  # raises UserError
-    return {UNTRAINED: Loaded("", OpenImageDenoise(1, "fast"), None, spec, 0)}
 
 
 def open_models(loaded: Mapping[str, Loaded]) -> dict[str, ModelRenderer]:

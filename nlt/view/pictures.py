@@ -8,7 +8,7 @@ from torch import Tensor
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
-from nlt.evaluation.render import DEMO, load_models, load_untrained, open_models
+from nlt.evaluation.render import DEMO, load_models, open_models
 from nlt.evaluation.results import MANIFEST, OK, RUNS, load
 from nlt.paths import is_checkpoint
 from nlt.scenes.camera import Camera
@@ -33,15 +33,12 @@ class Pictures:
         Raises:
             UserError: a file is missing or wrong, or the scene does not suit a method.
         """
-        untrained = source and not scene and not is_checkpoint(source) and not Path(source).is_dir()
-        if source and untrained:
-            loaded = load_untrained(source, experiment)
-        else:
-            loaded = load_models(find_checkpoints(source), scene, experiment=experiment)
-        self._models = open_models(loaded)
+        checkpoints = find_checkpoints(source, scene)
+        drawn = scene if checkpoints else source
+        self._models = open_models(load_models(checkpoints, drawn, experiment=experiment))
         self._any = next(iter(self._models.values()))
         self.scene = self._any.render.scene
-        self.names = [*({} if untrained else self._models), DENOISED, TRACED, REFERENCE]
+        self.names = [*(self._models if checkpoints else ()), DENOISED, TRACED, REFERENCE]
 
     @torch.no_grad()
     def draw(self, name: str, state: SceneState, camera: Camera, spp: int, frame: int = 0) -> Tensor:
@@ -71,8 +68,10 @@ class Pictures:
         return seconds
 
 
-def find_checkpoints(source: str | None) -> dict[str, str]:
+def find_checkpoints(source: str | None, scene: str | None = None) -> dict[str, str]:
     """Return the checkpoints of a source (see `Pictures`) by the labels of their methods; that of a file is empty.
+
+    There are none if the source is itself a scene.
 
     Raises:
         UserError: the results are incomplete, or a training that they name is gone.
@@ -80,7 +79,7 @@ def find_checkpoints(source: str | None) -> dict[str, str]:
     if source is None:
         return DEMO
     if not Path(source).is_dir():
-        return {"": source}
+        return {"": source} if scene or is_checkpoint(source) else {}
     from nlt.evaluation.trainings import newest_checkpoint  # here, because it takes a second that --demo can do without
 
     results, found = load(source), {}
