@@ -110,6 +110,11 @@ class DatasetSpec:
         """Return the samples per pixel of the path-traced image that is among a method's `fields`."""
         return self.noisy_spp if "noisy" in fields else self.input_spp
 
+    def has_points_of(self, other: DatasetSpec) -> bool:
+        """Whether the points of both datasets are the same, whatever their samples are."""
+        origin = lambda spec: (spec.scenes, spec.experiment, spec.num_points, spec.seed)
+        return origin(self) == origin(other)
+
     @property
     def points_nbytes(self) -> int:
         """The size of one scene's points on disk in bytes."""

@@ -120,8 +120,8 @@ class Comparison:
                     f"{place}: {start} must be a method of the comparison that starts from random weights; "
                     f"known are {', '.join(known)}"
                 )
-            elsewhere = found.training_specs[method] != spec
-            if elsewhere and build(found.configs[method], files[method][1]).has_point_embeddings:
+            own_points = not found.training_specs[method].has_points_of(spec)
+            if own_points and build(found.configs[method], files[method][1]).has_point_embeddings:
                 raise UserError(
                     f"{files[method][-1]}: data.dataset: {method} has embeddings of the points of its training scenes; "
                     "name only methods without them, such as photons_only"

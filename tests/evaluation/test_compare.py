@@ -17,6 +17,7 @@ import scipy.linalg
 import torch
 from made_results import make_results, papers_numbers
 from PIL import Image
+from safetensors.numpy import load_file
 from skimage.metrics import structural_similarity
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import DATASET, SCALE, use_tiny_inception, write
@@ -30,6 +31,7 @@ from nlt.data import engines
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec
+from nlt.data.store import points_name
 from nlt.evaluation import clock, compare, comparison, progress
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
@@ -505,6 +507,18 @@ def test_no_embeddings_of_another_room(world, elsewhere, capfd, trainings):
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and "elsewhere.yaml: data.dataset" in error and "photons_only" in error
     assert trainings == []
+
+
+def test_embeddings_from_more_images_of_the_same_room(world):
+    """A variant with more images has the comparison's points, so its embeddings belong to the compared room, too."""
+    file = write(world.folder / "configs/variant/more_images.yaml", {"data": {"dataset": {"train": 12}}})
+    rows = world.compare("--methods", "nlt", "nlt@more_images", out="more_images")
+    file.unlink()
+    runs = world.runs("more_images")
+    datasets = [world.tiny.dataset.parent / Path(runs[name]["run"]).parent.name for name in ("nlt", "nlt@more_images")]
+    here, more = (load_file(dataset / points_name(0))["position"] for dataset in datasets)
+    assert datasets[0] != datasets[1] and rows["nlt@more_images"]["mse"] != rows["nlt"]["mse"]
+    np.testing.assert_array_equal(here, more)
 
 
 @pytest.fixture
