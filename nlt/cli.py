@@ -145,7 +145,8 @@ def _render(options: argparse.Namespace) -> None:
     source, scene = options.source, options.scene
     if options.demo == bool(source) or (source and not scene and is_checkpoint(source)):
         raise UserError("give SCENE, CKPT and SCENE, or --demo; see nlt render --help")
-    from nlt.evaluation.render import DEMO, DEMO_SCENE, render
+    from nlt.view.drawing import DEMO, DEMO_SCENE
+    from nlt.view.video import render
 
     checkpoints: dict[str, str] = {}
     state, light, lights = options.state, options.light, options.lights

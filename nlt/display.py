@@ -1,5 +1,6 @@
 """The display transform from linear radiance to the sRGB values that are shown and compared."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,3 +21,9 @@ def display(radiance: Tensor, exposure: Tensor | float) -> Tensor:
     # The second clamp keeps the gradient finite at 0 in the branch that `where` discards.
     power = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, power)
+
+
+def display_bytes(radiance: np.ndarray, exposure: float) -> np.ndarray:
+    """Convert linear radiance (3, H, W) to sRGB (H, W, 3) uint8."""
+    srgb = display(torch.from_numpy(radiance)[None], exposure)[0].permute(1, 2, 0)
+    return (srgb.numpy() * 255).round().astype(np.uint8)

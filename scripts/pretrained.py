@@ -19,10 +19,10 @@ from nlt.config import read_configs
 from nlt.data.files import write_bytes
 from nlt.evaluation.export import load_trained, save_trained
 from nlt.evaluation.provenance import origin, surroundings
-from nlt.evaluation.render import DEMO
 from nlt.models.factory import read_checkpoint
 from nlt.models.policy import default_device
 from nlt.training import run_lightning
+from nlt.view.drawing import DEMO
 
 
 def main(checkpoint: str, commit: str) -> None:

@@ -19,13 +19,13 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 from tensorboard import program
 
-from nlt.evaluation.render import DEMO, DEMO_SCENE
 from nlt.evaluation.results import load
 from nlt.report.dashboard import write_logs
 from nlt.report.draw import draw
 from nlt.report.page import PAGE
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import load_description
+from nlt.view.drawing import DEMO, DEMO_SCENE
 from nlt.view.pictures import REFERENCE
 
 

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw
 
 from nlt.data.engines import Process
-from nlt.display import display
+from nlt.display import display_bytes
 from nlt.rendering.renderer import Renderer
 from nlt.rendering.variant import choose_variant, use_variant
 from nlt.scenes.assembly import Scene
@@ -71,6 +70,5 @@ def _images(
         radiance = renderer.radiance(sampler.sample(resolution, rng), spp, seed + k)
         luminance = np.tensordot(_LUMINANCE, radiance * description.exposure, 1)
         logarithms.append(np.log(luminance + _BLACK).mean())
-        shown = display(torch.from_numpy(radiance)[None], description.exposure)[0]
-        images.append((shown.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
+        images.append(display_bytes(radiance, description.exposure))
     return images, float(np.exp(np.mean(logarithms)))

@@ -1,1 +1,1 @@
-"""`nlt view`: a scene in the browser, drawn by trained methods, Open Image Denoise and path tracing."""
+"""Scenes drawn by trained methods, Open Image Denoise and path tracing: videos, and a viewer in the browser."""

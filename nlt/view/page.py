@@ -15,8 +15,8 @@ import viser
 from PIL import Image
 from torch import Tensor
 
+from nlt.display import display_bytes
 from nlt.errors import UserError
-from nlt.evaluation.render import shown
 from nlt.rendering.exr import exr
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import Experiment, Movable
@@ -224,7 +224,7 @@ class Page:
         screen.images = {key: image for key, image in screen.images.items() if key[2] == size_and_place}
         screen.drawn = wanted
         radiance = torch.cat([both[0][..., :split], both[-1][..., split:]], -1)
-        screen.picture = shown(radiance.numpy(), self.description.exposure * 2.0**self.stops.value)
+        screen.picture = display_bytes(radiance.numpy(), self.description.exposure * 2.0**self.stops.value)
         screen.client.scene.set_background_image(screen.picture, "jpeg" if moving else "png", jpeg_quality=90)
         seconds = time.perf_counter() - start
         if moving:

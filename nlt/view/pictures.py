@@ -8,12 +8,12 @@ from torch import Tensor
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
-from nlt.evaluation.render import DEMO, load_models, open_models
 from nlt.evaluation.results import MANIFEST, OK, RUNS, load
 from nlt.paths import is_checkpoint
 from nlt.scenes.camera import Camera
 from nlt.scenes.description import Experiment
 from nlt.scenes.state import SceneState
+from nlt.view.drawing import DEMO, load_models, open_models
 
 DENOISED, TRACED, REFERENCE = "Open Image Denoise", "path tracing", "reference (accumulates)"
 

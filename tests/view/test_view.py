@@ -15,11 +15,12 @@ import pytest
 import torch
 from PIL import Image
 
+from nlt.display import display_bytes
 from nlt.errors import UserError
-from nlt.evaluation.render import DEMO, load_models, open_models, shown
 from nlt.evaluation.results import write_manifest, write_rows
 from nlt.scenes.state import rest_state
 from nlt.scenes.trajectory import cameras, states
+from nlt.view.drawing import DEMO, load_models, open_models
 from nlt.view.page import clamp
 from nlt.view.pictures import DENOISED, REFERENCE, TRACED, Pictures
 
@@ -109,7 +110,7 @@ class Shown(SimpleNamespace):
         state, camera = self.asked()
         with torch.no_grad():
             image = self.model.traced(state, camera, spp, 0) if spp else self.model.frame(state, camera)
-        return shown(image[0].numpy(), self.model.render.description.exposure) / 255
+        return display_bytes(image[0].numpy(), self.model.render.description.exposure) / 255
 
     def canvas(self):
         return max(self.page.locator("canvas").all(), key=lambda canvas: canvas.bounding_box()["width"])
@@ -237,7 +238,7 @@ def test_saves_what_it_shows_and_quits(open_page, model, process):
     with OpenEXR.File(str(page.saved("EXR")["view.exr"]), separate_channels=True) as file:
         layers = {name: channel.pixels for name, channel in file.channels().items()}
     radiance = np.stack([layers[channel] for channel in "RGB"])
-    assert np.abs(shown(radiance, model.render.description.exposure) / 255 - png).max() <= 1 / 255
+    assert np.abs(display_bytes(radiance, model.render.description.exposure) / 255 - png).max() <= 1 / 255
     np.testing.assert_allclose(layers["Depth.Z"], model.gbuffer(state, camera)["depth"][0], rtol=1e-4)
     page.page.get_by_role("button", name="quit", exact=True).click()
     assert ends_cleanly(process)

@@ -23,26 +23,24 @@ from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
 from nlt.data.store import points_name, read_points, write_shard
-from nlt.display import display
+from nlt.display import display, display_bytes
 from nlt.evaluation.export import load_trained, save_trained
-from nlt.evaluation.render import (
-    DEMO,
-    DEMO_SCENE,
-    UNTRAINED,
-    ModelRenderer,
-    load_models,
-    open_models,
-    render,
-    shown,
-    with_scene,
-    write_video,
-)
 from nlt.models.nlt import NeuralLightTransport
 from nlt.models.policy import Policy, accelerate
 from nlt.models.steady import Steady
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.state import rest_state, sample_state
 from nlt.scenes.trajectory import cameras, follow, states, turn, write_camera, write_state
+from nlt.view.drawing import (
+    DEMO,
+    DEMO_SCENE,
+    UNTRAINED,
+    ModelRenderer,
+    load_models,
+    open_models,
+    with_scene,
+)
+from nlt.view.video import render, write_video
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -53,7 +51,8 @@ SIZE = (16, 12)  # width, height
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nlt.evaluation.render.default_device", lambda: CPU)
+    for module in ("drawing", "video"):
+        monkeypatch.setattr(f"nlt.view.{module}.default_device", lambda: CPU)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +218,7 @@ def test_layers_of_frames(models, tmp_path, refused):
         with OpenEXR.File(str(tmp_path / f"frames/0000{k}.exr"), separate_channels=True) as file:
             found = {name: channel.pixels for name, channel in file.channels().items()}
         layer = lambda *names: np.stack([found[name] for name in names])  # noqa: B023
-        sheet = [shown(layer(*(f"{p}{c}" for c in "RGB")), exposure) for p in ("", "Noisy Image.")]
+        sheet = [display_bytes(layer(*(f"{p}{c}" for c in "RGB")), exposure) for p in ("", "Noisy Image.")]
         assert (pixels(tmp_path / f"frames/0000{k}.png") == before[k]).all()
         assert (before[k][:16] == np.concatenate(sheet, 1)).all()
         model.render.scene.set_state(moment)
@@ -353,7 +352,7 @@ def test_without_training(tmp_path):
     guides = renderer.view(view, np.random.SeedSequence([0]), {"albedo", "normal"})
     batch = {name: torch.from_numpy(value)[None] for name, value in {**guides, "traced": traced}.items()}
     denoised = OpenImageDenoise(1, "fast")(batch | {"exposure": torch.tensor([description.exposure])})[0].numpy()
-    expected = np.concatenate([shown(image, description.exposure) for image in (denoised, traced)], axis=1)
+    expected = np.concatenate([display_bytes(image, description.exposure) for image in (denoised, traced)], axis=1)
     np.testing.assert_array_equal(pixels(tmp_path / "own/00000.png")[:16], expected)
 
 
