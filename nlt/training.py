@@ -160,9 +160,9 @@ class NLTCLI(LightningCLI):
         Raises:
             UserError: it is not a checkpoint, of another method or size, or of one with embeddings.
         """
-        if self.model.has_point_embeddings:
+        if self.model.learns_its_scenes:
             raise UserError(
-                f"--start_from: {checkpoint}: the method has embeddings of the points of its training scenes; use a "
+                f"--start_from: {checkpoint}: the method learns its training scenes (embeddings or a field); use a "
                 "method without them, such as photons_only, or resume with --ckpt_path"
             )
         weights = load_method(checkpoint, "--start_from").state_dict()

@@ -161,7 +161,7 @@ def test_training_starts_from_weights(tiny, checkpoint, tmp_path):
 @pytest.mark.parametrize(
     ("method", "options", "message"),
     [
-        ("nlt", [], "the method has embeddings of the points of its training scenes"),
+        ("nlt", [], "the method learns its training scenes (embeddings or a field)"),
         ("denoising_1_1", [], "checkpoint is of CNN, not SparseDenoising"),
         ("cnn", ["--model.init_args.width=4"], "checkpoint has width=2, this model width=4"),
     ],

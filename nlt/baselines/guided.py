@@ -1,4 +1,4 @@
-"""Guided denoising of one sample per pixel, not in the paper: path tracing, the G-buffer, and points or photons."""
+"""Guided denoising of one sample per pixel, not in the paper: path tracing, G-buffer, points, photons or a field."""
 
 from typing import Any
 
@@ -6,22 +6,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlt.baselines.neural_field import NeuralField
 from nlt.errors import UserError
 from nlt.models.module import Batch, join_channels, log_exposed
-from nlt.models.nlt import NeuralLightTransport
 
 _LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
 _DARKEST = 1e-6  # W·sr⁻¹·m⁻²; keeps the exposure of a black image finite
 
 
-class GuidedOneSample(NeuralLightTransport):
-    """The paper's method, whose U-Net also sees path-traced radiance at 1 spp; by default without points and photons.
+class GuidedOneSample(NeuralField):
+    """The paper's method, whose U-Net also sees path-traced radiance at 1 spp; by default without points or photons.
 
     It reads the 1-spp image, which other methods train towards, and trains towards the 4-spp image, which denoisers
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    architecture = (*NeuralLightTransport.architecture, "relative", "gap", "rows_only")
+    architecture = (*NeuralField.architecture, "relative", "gap", "rows_only")
 
     def __init__(
         self,
@@ -30,6 +30,7 @@ class GuidedOneSample(NeuralLightTransport):
         relative: bool = False,
         gap: int = 0,
         rows_only: bool = False,
+        field_width: int = 0,
         **kwargs: Any,
     ) -> None:
         """The keyword arguments are those of the base class.
@@ -42,10 +43,11 @@ class GuidedOneSample(NeuralLightTransport):
             gap: leave out as many pixels between two traced ones, in rows and columns. With k = gap + 1, a traced pixel
                 stands for the k x k pixels around it.
             rows_only: leave out rows, not columns; a traced pixel stands for the k pixels around it in its column.
+            field_width: channels of the field (nlt/baselines/neural_field.py); 0 for no field.
         """
         if gap < 0:
             raise UserError(f"model.init_args.gap: must be 0 or more, is {gap}")
-        super().__init__(use_points, use_photons, **kwargs)
+        super().__init__(field_width, use_points, use_photons, **kwargs)
 
     @property
     def feature_channels(self) -> int:
@@ -71,7 +73,7 @@ class GuidedOneSample(NeuralLightTransport):
         return mask
 
     def gbuffer(self, batch: Batch) -> Tensor:
-        """Return the G-buffer and the noisy radiance without lamps in view, divided by the albedo (B, 13, H, W)."""
+        """Return the G-buffer, any field, and the noisy radiance without lamps in view, divided by the albedo."""
         reflected = F.interpolate(log_exposed(self._reflected(batch), self._exposure(batch)), batch["depth"].shape[2:])
         return join_channels([super().gbuffer(batch), reflected])
 

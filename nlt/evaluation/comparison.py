@@ -121,10 +121,10 @@ class Comparison:
                     f"known are {', '.join(known)}"
                 )
             own_points = not found.training_specs[method].has_points_of(spec)
-            if own_points and build(found.configs[method], files[method][1]).has_point_embeddings:
+            if own_points and build(found.configs[method], files[method][1]).learns_its_scenes:
                 raise UserError(
-                    f"{files[method][-1]}: data.dataset: {method} has embeddings of the points of its training scenes; "
-                    "name only methods without them, such as photons_only"
+                    f"{files[method][-1]}: data.dataset: {method} learns its training scenes (embeddings or a field); "
+                    "name only methods that do not, such as photons_only"
                 )
         return found
 

@@ -132,6 +132,11 @@ class RenderingModule(Method, L.LightningModule):
         return False
 
     @property
+    def learns_its_scenes(self) -> bool:
+        """Whether the method learns something that holds in its training scenes only: embeddings or a field."""
+        return self.has_point_embeddings
+
+    @property
     def feature_channels(self) -> int:
         """Number of channels that `features` returns."""
         raise NotImplementedError

@@ -177,9 +177,9 @@ def load_models(
     loaded = {}
     for name, checkpoint in checkpoints.items():
         method, spec, points = load_trained(checkpoint)
-        if experiment and experiment != spec.experiment and method.has_point_embeddings:
+        if experiment and experiment != spec.experiment and method.learns_its_scenes:
             raise UserError(
-                f"--lights: {checkpoint} has point embeddings, which were trained in the experiment {spec.experiment}; "
+                f"--lights: {checkpoint} has embeddings or a field, trained in the experiment {spec.experiment}; "
                 "omit the option"
             )
         scene = scene or spec.scenes[0]
@@ -224,9 +224,9 @@ def with_scene(method: RenderingModule, spec: DatasetSpec, scene: str, checkpoin
     if file in files:
         return spec, files.index(file)
     load_description(scene)
-    if method.has_point_embeddings:
+    if method.learns_its_scenes:
         raise UserError(
-            f"SCENE: {scene}: {checkpoint} has point embeddings only for {', '.join(spec.scenes)}; "
+            f"SCENE: {scene}: {checkpoint} has embeddings or a field only for {', '.join(spec.scenes)}; "
             "name one of these, or train on this scene"
         )
     return dataclasses.replace(spec, scenes=[scene]), 0

@@ -129,7 +129,7 @@ def mirrored(batch):
 
 def reads_positions(method):
     """It is fed with absolute positions or directions, so a prediction depends on the world's frame."""
-    transports = isinstance(method, NeuralLightTransport) and "camera_matrix" in method.inputs
+    transports = isinstance(method, NeuralLightTransport) and "world_to_view" in method.inputs
     return transports or method.hparams.get("position", False)
 
 
