@@ -57,7 +57,8 @@ if [ "$scale" = small ]; then
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
         --methods cnn cnn@before cnn@images_6400 nlt_photons nlt_photons@before photons_only@images_6400 oidn_1 oidn_4
     room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
-        --methods $table2 photons_only guided_1spp cnn@before nlt_photons@before
+        --methods cnn guided_1spp guided_1spp_field photons_only field photon_field \
+        oidn_1 oidn_4 oidn_1_balanced oidn_1_fast path_tracing_1 path_tracing_4
     room --config front --scale any_room --out results/any_room \
         --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
     once python benchmarks/leaner.py --seeds 2
