@@ -192,7 +192,7 @@ def _scenes(options: argparse.Namespace) -> None:
         print(listing())
         return
     if options.action == "preview":
-        from nlt.evaluation.preview import contact_sheet
+        from nlt.view.preview import contact_sheet
 
         views, size = options.views, options.resolution
         contact_sheet(options.names, options.output, views, size, options.spp, options.experiment, options.seed)

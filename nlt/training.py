@@ -158,7 +158,7 @@ class NLTCLI(LightningCLI):
         """Copy the weights of a checkpoint; with `ckpt_path`, Lightning overrides them by those of the resumed run.
 
         Raises:
-            UserError: it is not a checkpoint, of another method or size, or of one with embeddings.
+            UserError: it is not a checkpoint, of another method or size, or of one that learns its training scenes.
         """
         if self.model.learns_its_scenes:
             raise UserError(
@@ -166,7 +166,7 @@ class NLTCLI(LightningCLI):
                 "method without them, such as photons_only, or resume with --ckpt_path"
             )
         weights = load_method(checkpoint, "--start_from").state_dict()
-        # Only embeddings depend on the number of scenes and points.
+        # Only embeddings and fields, which are refused above, depend on the number of scenes and points.
         self.model.check_checkpoint(read_checkpoint(checkpoint), checkpoint, ("num_scenes", "num_points"))
         self.model.load_state_dict(weights)
 

@@ -78,16 +78,15 @@ class NeuralField(NeuralLightTransport):
         gbuffer = super().gbuffer(batch)
         if not self.hparams["field_width"]:
             return gbuffer
-        scene = F.one_hot(batch["scene"], self.hparams["num_scenes"])[:, None, None]
-        place = torch.cat([self._place(batch), scene.expand(-1, *gbuffer.shape[2:], -1)], dim=-1)
-        return join_channels([gbuffer, self.field(place).permute(0, 3, 1, 2)])
+        return join_channels([gbuffer, self.field(self._place(batch)).permute(0, 3, 1, 2)])
 
     def _place(self, batch: Batch) -> Tensor:
-        """Return what the field reads of the surface in each pixel (B, H, W, _ATTRIBUTES), in world space."""
+        """Return what the field reads of each pixel (B, H, W, _ATTRIBUTES + num_scenes), in world space."""
         position, normal = surface_positions(batch), batch["normal"].permute(0, 2, 3, 1)
         to_light = mean_light(batch)[:, None, None] - position
         distance = torch.linalg.vector_norm(to_light, dim=-1, keepdim=True) + _NEAREST
         cosine = (to_light * normal).sum(-1, keepdim=True) / distance
         angle = position[..., None] * (2 * math.pi / _LONGEST * 2 ** torch.arange(_OCTAVES, device=position.device))
         waves = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
-        return torch.cat([waves, normal, to_light / distance, cosine, distance.log()], dim=-1)
+        scene = F.one_hot(batch["scene"], self.hparams["num_scenes"])[:, None, None].expand(*distance.shape[:3], -1)
+        return torch.cat([waves, normal, to_light / distance, cosine, distance.log(), scene], dim=-1)

@@ -1,1 +1,1 @@
-"""Scenes drawn by trained methods, Open Image Denoise and path tracing: videos, and a viewer in the browser."""
+"""Scenes drawn by trained methods, Open Image Denoise and path tracing: videos, contact sheets, a viewer."""

@@ -63,7 +63,7 @@ def render(
         checkpoints: checkpoints of `nlt fit` in their runs, or safetensors of `nlt export`, by the names shown; all of
             one experiment. An empty name stands for the name of the method's class. Without any, Open Image Denoise
             draws the scene.
-        scene: a scene of the methods' datasets; any scene for methods that do not learn theirs.
+        scene: a scene of the methods' datasets; any scene if no method has embeddings or a field.
         output: VIDEO.mp4, next to which VIDEO.png, the first frame, and VIDEO.json, the manifest, are written; or a
             folder for PNGs.
         state, light, camera_path: see nlt/scenes/trajectory.py.

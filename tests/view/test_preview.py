@@ -6,11 +6,11 @@ from conftest import write_room
 from PIL import Image
 
 from nlt.errors import UserError
-from nlt.evaluation.preview import contact_sheet
 from nlt.rendering.renderer import Renderer
 from nlt.scenes.assembly import Scene
 from nlt.scenes.description import load_description
 from nlt.scenes.state import sample_state, sample_view
+from nlt.view.preview import contact_sheet
 
 
 def test_contact_sheet(tmp_path, capsys):
