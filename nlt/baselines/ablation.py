@@ -17,7 +17,6 @@ class InputAblation(CloudMethod):
     """Sec. "Ablation Study on Static Scene": the U-Net on any combination of inputs, without light transport."""
 
     architecture = (*CloudMethod.architecture, "num_scenes", "num_points", *INPUTS, "embedding")
-    stages = ("gbuffer",)
 
     def __init__(
         self,

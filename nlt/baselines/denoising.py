@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, Batch, RenderingModule, join_channels, log_exposed
+from nlt.models.module import Batch, RenderingModule, join_channels, log_exposed
 
 
 def _hash(x: Tensor) -> Tensor:
@@ -49,15 +49,11 @@ class SparseDenoising(RenderingModule):
 
     @property
     def feature_channels(self) -> int:
-        return 4 + GBUFFER_CHANNELS * self.hparams["gbuffer"]  # radiance and mask
+        return 4 + self.gbuffer_channels * self.hparams["gbuffer"]  # radiance and mask
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return (*(GBUFFER if self.hparams["gbuffer"] else ()), "noisy_input")
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        return (*(("gbuffer",) if self.hparams["gbuffer"] else ()), "path_tracing")
+        return (*(self.gbuffer_inputs if self.hparams["gbuffer"] else ()), "noisy_input")
 
     @property
     def pixel_fraction(self) -> float:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from nlt.models.clouds import CloudMethod
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features
+from nlt.models.module import PROJECTION, Batch, Features
 from nlt.models.transport import PointEmbedding
 
 
@@ -11,8 +11,6 @@ class FeatureProjection(CloudMethod):
     """Sec. "Baselines" (3), similar to Aliev et al. 2019: G-buffer and projected point embeddings."""
 
     architecture = (*CloudMethod.architecture, "num_scenes", "num_points", "embedding")
-    inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "point_position", "point_visible")))
-    stages = ("gbuffer",)
 
     def __init__(self, embedding: int = 64, **kwargs: Any) -> None:
         """The keyword arguments are those of the base class.
@@ -26,7 +24,11 @@ class FeatureProjection(CloudMethod):
 
     @property
     def feature_channels(self) -> int:
-        return GBUFFER_CHANNELS + self.hparams["embedding"]
+        return self.gbuffer_channels + self.hparams["embedding"]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys((*self.gbuffer_inputs, *PROJECTION, "point_position", "point_visible")))
 
     def features(self, batch: Batch, transported: Any = None) -> Features:
         points = (self.embedding(batch["scene"]), batch["point_position"], batch["point_visible"])

@@ -58,10 +58,6 @@ class GuidedOneSample(NeuralField):
         return (*super().inputs, "emission", "noisy")
 
     @property
-    def stages(self) -> tuple[str, ...]:
-        return (*super().stages, "path_tracing")
-
-    @property
     def pixel_fraction(self) -> float:
         rows, columns = self._steps
         return 1 / (rows * columns)

@@ -69,12 +69,8 @@ class NeuralField(NeuralLightTransport):
         field = ("world_to_view", "photon_origin", "photon_flux", "photon_valid") if self.hparams["field_width"] else ()
         return tuple(dict.fromkeys((*super().inputs, *field)))
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        return ("gbuffer", "photons") if self.hparams["field_width"] else super().stages
-
     def gbuffer(self, batch: Batch) -> Tensor:
-        """Return the G-buffer and the field (B, 10 + field_width, H, W)."""
+        """Return the G-buffer and the field (B, gbuffer_channels + field_width, H, W)."""
         gbuffer = super().gbuffer(batch)
         if not self.hparams["field_width"]:
             return gbuffer

@@ -16,7 +16,6 @@ class PathTracing(Method):
     """Path tracing of every pixel at `spp` samples, without denoising."""
 
     inputs: tuple[str, ...] = ("traced",)
-    stages: tuple[str, ...] = ("path_tracing",)
 
     def __init__(self, spp: int = 1) -> None:
         """Render at `spp` samples per pixel."""
@@ -41,7 +40,6 @@ class OpenImageDenoise(PathTracing):
     """
 
     inputs = ("traced", "albedo", "normal")
-    stages = ("gbuffer", "path_tracing")
 
     def __init__(self, spp: int = 1, quality: Quality = "high") -> None:
         """Denoise a rendering at `spp` samples per pixel; `quality` is OIDN's mode, from fastest to slowest."""

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.models.clouds import CloudMethod
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, join_channels, log_exposed
+from nlt.models.module import PROJECTION, Batch, join_channels, log_exposed
 from nlt.models.projection import total, visible_pixels
 
 _RADII = (1, 2, 4, 8)  # of footprints, in pixels from the middle one
@@ -44,9 +44,6 @@ class PhotonSplat(CloudMethod):
     """The U-Net on the G-buffer and the log of the irradiance, a photon density estimate (Jensen 1996)."""
 
     architecture = (*CloudMethod.architecture, "footprint")
-    inputs = tuple(dict.fromkeys((*GBUFFER, *PROJECTION, "photon_flux", "photon_hit", "photon_valid")))
-    stages = ("gbuffer", "photons")
-    feature_channels = GBUFFER_CHANNELS + 3
 
     def __init__(self, footprint: int = 4, **kwargs: Any) -> None:
         """The keyword arguments are those of the base class.
@@ -57,6 +54,15 @@ class PhotonSplat(CloudMethod):
                 choosing the footprint by its photons biases the estimate by about a tenth.
         """
         super().__init__(**kwargs)
+
+    @property
+    def feature_channels(self) -> int:
+        return self.gbuffer_channels + 3
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        photons = ("photon_flux", "photon_hit", "photon_valid")
+        return tuple(dict.fromkeys((*self.gbuffer_inputs, *PROJECTION, *photons)))
 
     def irradiance(self, batch: Batch) -> Tensor:
         """Return the irradiance (B, 3, H, W), W·m⁻², from emitters on the surface in each pixel; 0 where no hit."""

@@ -91,6 +91,8 @@ class SampleRenderer:
         sample |= {name: self.radiance(camera, *image) for name, image in images.items() if name in fields}
         if not fields.keys().isdisjoint(BUFFERS):
             sample |= self.renderer.gbuffer(camera)
+        if "direct" in fields:
+            sample["direct"] = self.renderer.direct(camera)
         if any(name.startswith("photon_") for name in fields):
             sample |= self.renderer.photons(spec.num_photons, photons)
         return {

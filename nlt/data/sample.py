@@ -58,6 +58,12 @@ FIELDS: dict[str, Field] = {
     "emission": Field(
         (3, "H", "W"), "float32", _RADIANCE, "pixel mean of the radiance seen directly from lamps and the environment"
     ),
+    "direct": Field(
+        (3, "H", "W"),
+        "float32",
+        _RADIANCE,
+        "radiance that a white diffuse surface at the pixel centre would reflect of direct light; noise-free",
+    ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, maps view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, maps world space to view space; a rigid transform"),
     "photon_origin": Field(("P", 3), "float32", "m", "point at which the photon left its emitter"),

@@ -27,6 +27,7 @@ STAGES = {
     "noisy": ("noisy",),
     "noisy_input": ("noisy_input",),
     "G-buffer": BUFFERS,
+    "direct light": ("direct",),
     "photons": ("photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid"),
     "reference": ("reference_a", "reference_b"),
     "storing": (),
@@ -129,6 +130,7 @@ def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str,
     lap("noisy", lambda: trace.radiance(camera, spec.noisy_spp, k))
     lap("noisy_input", lambda: trace.radiance(camera, spec.input_spp, k))
     lap("G-buffer", lambda: trace.gbuffer(camera))
+    lap("direct light", lambda: trace.direct(camera))
     lap("photons", lambda: trace.photons(spec.num_photons, k))
     lap("reference", lambda: trace.radiance(camera, timed_spp(spec), k))
     lap("storing", store)

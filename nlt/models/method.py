@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nlt.data.sample import BUFFERS, TRACED
+
 Batch = dict[str, Tensor]
 
 
@@ -30,13 +32,22 @@ class Method(nn.Module):
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The renderer stages that a frame needs, out of "gbuffer", "photons" and "path_tracing"."""
-        raise NotImplementedError
+        """The renderer stages that a frame needs, out of "gbuffer", "direct_light", "photons" and "path_tracing"."""
+        stages = {
+            "gbuffer": self._reads(*BUFFERS),
+            "direct_light": self._reads("direct"),
+            "photons": any(name.startswith("photon_") for name in self.inputs),
+            "path_tracing": self.pixel_fraction > 0,
+        }
+        return tuple(name for name, needed in stages.items() if needed)
 
     @property
     def pixel_fraction(self) -> float:
         """The fraction of the pixels that the stage "path_tracing" traces."""
-        return float("path_tracing" in self.stages)
+        return float(self._reads(*TRACED, "traced"))
+
+    def _reads(self, *names: str) -> bool:
+        return not {*names}.isdisjoint(self.inputs)
 
     @property
     def spp(self) -> int | None:

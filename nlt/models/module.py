@@ -27,8 +27,6 @@ from nlt.models.unet import UNet
 GBUFFER = ("depth", "normal", "albedo", "view_direction")
 PROJECTION = ("depth", "normal", "camera_matrix", "world_to_view")
 
-GBUFFER_CHANNELS = 10
-
 _WARM_UP = 0.05  # share of the steps, with lr_schedule "cosine"
 
 Steps = dict[str, Callable[[Batch, Any], Any]]
@@ -67,14 +65,14 @@ def join_channels(maps: Sequence[Tensor]) -> Tensor:
 
 
 class RenderingModule(Method, L.LightningModule):
-    """The base of all trained methods. A subclass defines `feature_channels`, `inputs`, `stages` and `features`.
+    """The base of all trained methods. A subclass defines `feature_channels`, `inputs` and `features`.
 
     A frame takes three steps, which can be timed separately: `transport` (3D), `features` (projection and all other
     inputs of the U-Net) and `synthesize` (2D).
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
-    architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission")
+    architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission", "direct_light")
     # Fast paths at inference, which `nlt.models.policy.accelerate` switches on; see `Policy`.
     sparse = in_bfloat16 = False
 
@@ -84,6 +82,7 @@ class RenderingModule(Method, L.LightningModule):
         depth: int = 3,
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
+        direct_light: bool = False,
         loss: Literal["mse", "relative_mse"] = "mse",
         optimizer: Literal["adam", "muon"] = "adam",
         learning_rate: float = 5e-4,
@@ -102,6 +101,8 @@ class RenderingModule(Method, L.LightningModule):
                 as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
+            direct_light: methods that read the G-buffer also read the direct light, which the renderer gives without
+                noise (`Renderer.direct`). Not in the paper.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
                 biases and the embeddings (nlt/models/muon.py).
@@ -178,9 +179,22 @@ class RenderingModule(Method, L.LightningModule):
 
     # --- what all methods share ---
 
+    @property
+    def gbuffer_inputs(self) -> tuple[str, ...]:
+        """The batch fields that `gbuffer` reads."""
+        return (*GBUFFER, "direct") if self.hparams["direct_light"] else GBUFFER
+
+    @property
+    def gbuffer_channels(self) -> int:
+        """The number of channels that `gbuffer` returns."""
+        return 13 if self.hparams["direct_light"] else 10
+
     def gbuffer(self, batch: Batch) -> Tensor:
-        """Return depth, normal, albedo and view direction (B, 10, H, W)."""
-        return join_channels([batch[name] for name in GBUFFER])
+        """Return depth, normal, albedo, view direction and, if chosen, direct light (B, 10 or 13, H, W)."""
+        maps = [batch[name] for name in GBUFFER]
+        if self.hparams["direct_light"]:
+            maps.append(log_exposed(batch["direct"], batch["exposure"]))
+        return join_channels(maps)
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""

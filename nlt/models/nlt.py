@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlt.data.sample import MATERIALS
 from nlt.models.clouds import CloudMethod
-from nlt.models.module import GBUFFER, GBUFFER_CHANNELS, PROJECTION, Batch, Features, log_exposed
+from nlt.models.module import PROJECTION, Batch, Features, log_exposed
 from nlt.models.projection import average_rows, visible_pixels, visible_rows
 from nlt.models.transport import PhotonNetwork, PointEmbedding, PointNet
 
@@ -44,18 +44,14 @@ class NeuralLightTransport(CloudMethod):
     def feature_channels(self) -> int:
         chosen = self.hparams
         points = chosen["point_width"] * chosen["use_points"]
-        return GBUFFER_CHANNELS + points + chosen["photon_width"] * chosen["use_photons"]
+        return self.gbuffer_channels + points + chosen["photon_width"] * chosen["use_photons"]
 
     @property
     def inputs(self) -> tuple[str, ...]:
         points = tuple(f"point_{name}" for name in ("position", "visible", "material", "albedo", "emission"))
         photons = tuple(f"photon_{name}" for name in ("origin", "direction", "flux", "hit", "valid"))
         used = (points if self.hparams["use_points"] else ()) + (photons if self.hparams["use_photons"] else ())
-        return tuple(dict.fromkeys((*GBUFFER, *(PROJECTION if used else ()), *used)))
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        return ("gbuffer", "photons") if self.hparams["use_photons"] else ("gbuffer",)
+        return tuple(dict.fromkeys((*self.gbuffer_inputs, *(PROJECTION if used else ()), *used)))
 
     def transport(self, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
         """Return features of the points (B, N, point_width) and photons (B, P, photon_width), None if not used.

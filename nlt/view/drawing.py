@@ -90,6 +90,9 @@ class ModelRenderer:
             self._key = state.key
         with self.stage("gbuffer"):
             view = self.render.view(camera, self._seeds, {*(names & {*BUFFERS}), "camera_matrix", "world_to_view"})
+        if "direct" in names:
+            with self.stage("direct_light"):
+                view |= self.render.view(camera, self._seeds, {"direct"})
         if traced:
             with self.stage("path_tracing"):
                 view |= self.render.view(camera, seeds, traced)

@@ -108,14 +108,45 @@ def test_bfloat16_autocast(method):
     torch.testing.assert_close(mixed, method(batch), rtol=0.05, atol=0.05)
 
 
-def test_stages_are_those_of_the_inputs(method):
-    photons = any(name.startswith("photon_") for name in method.inputs)
-    stages = {
-        "gbuffer": not {"depth", "normal"}.isdisjoint(method.inputs),
-        "photons": photons,
-        "path_tracing": method.pixel_fraction > 0,
-    }
-    assert method.stages == tuple(stage for stage, needed in stages.items() if needed)
+@pytest.mark.parametrize(
+    ("name", "stages"),
+    {
+        "cnn": ("gbuffer",),
+        "feature_projection": ("gbuffer",),
+        "nlt": ("gbuffer",),
+        "nlt_photons": ("gbuffer", "photons"),
+        "photon_splat": ("gbuffer", "photons"),
+        "field": ("gbuffer", "photons"),
+        "guided_1spp": ("gbuffer", "path_tracing"),
+        "guided_1spp_field": ("gbuffer", "photons", "path_tracing"),
+        "guided_1_64": ("gbuffer", "path_tracing"),
+        "denoising_1_1": ("path_tracing",),
+        "ablation_1": ("gbuffer",),
+    }.items(),
+)
+def test_stages_are_those_of_the_inputs(name, stages):
+    assert build(find_config("model", name)).stages == stages
+
+
+DIRECT = [path for path in CONFIGS if not path.stem.startswith(("denoising", "ablation"))]
+
+
+@pytest.mark.parametrize("config", DIRECT, ids=lambda path: path.stem)
+def test_direct_light(config):
+    """A switch of every method that reads the G-buffer: three more channels, one more stage."""
+    batch, without = synthetic_batch(), build(config)
+    method = build(config, find_config("variant", "direct")).eval()
+    assert {*method.inputs} - {*without.inputs} == {"direct"}
+    assert [stage for stage in method.stages if stage != "direct_light"] == [*without.stages]
+    assert method.feature_channels == without.feature_channels + 3
+    with torch.no_grad():
+        features = method.features(batch, method.transport(batch))
+        assert features.shape[1] == method.feature_channels
+        brighter = method.features(batch | {"direct": batch["direct"] + 1}, method.transport(batch))
+    changed = (features != brighter).any(0).any(-1).any(-1)
+    assert changed.sum() == 3
+    expected = torch.log1p(batch["direct"] * batch["exposure"].view(-1, 1, 1, 1))
+    torch.testing.assert_close(features[:, changed], expected)
 
 
 def test_doubled_exposure_of_halved_light(method):
@@ -123,7 +154,7 @@ def test_doubled_exposure_of_halved_light(method):
     batch = synthetic_batch()
     method.eval()
     expected = method(batch) / 2
-    for name in ("noisy", "emission", "noisy_input", "point_emission", "photon_flux"):
+    for name in ("noisy", "emission", "direct", "noisy_input", "point_emission", "photon_flux"):
         batch[name] = batch[name] / 2
     batch["exposure"] = batch["exposure"] * 2
     torch.testing.assert_close(method(batch), expected)

@@ -1,9 +1,11 @@
-"""Photons agree with Mitsuba's irradiancemeter, the G-buffer with its AOVs, and `noisy` with the reference."""
+"""Photons agree with Mitsuba's irradiancemeter, direct light with a sum in float64, the G-buffer with Mitsuba's AOVs,
+and `noisy` with the reference.
+"""
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import plain_scene, write_room
+from conftest import LIGHT, plain_scene, write_room
 from scipy import ndimage, stats
 from torch.utils.data import default_collate
 
@@ -106,6 +108,60 @@ def test_photon_splat(tmp_path):
         region = lambda images, pixels=pixels: np.asarray(images)[..., pixels].mean(-1)
         assert compatible(region(ours), region(direct)) > 1e-3
         assert compatible(region(ours), region(bounced)) < 1e-6, "direct cannot be told from indirect"
+
+
+# ---- direct light ---------------------------------------------------------------------------------------
+
+
+def passes_crate(start, end):
+    """Return whether the segments (n, 3) miss the crate of `write_room`, by its three slabs."""
+    low, high = np.array([-0.6, 0, 0.05]) - start, np.array([-0.2, 0.5, 0.35]) - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near, far = np.sort([low / (end - start), high / (end - start)], axis=0)
+    return (near.max(1) > far.min(1)) | (near.max(1) > 1) | (far.min(1) < 0)
+
+
+def test_direct_light(tmp_path):
+    """Four shadow rays agree with 1,024: within 1 % where they reach the whole lamp, and in the dark exactly."""
+    description = load_description(str(write_room(tmp_path)))
+    renderer = Renderer(Scene(description, "fixed_lights"))
+    camera = Camera.look_at(np.array([-0.9, 1.2, -0.6]), np.array([-0.6, 0, 0.2]), np.array([0, 1.0, 0]), 60, 32, 32)
+    buffer, direct = renderer.gbuffer(camera), renderer.direct(camera)
+    assert np.array_equal(renderer.direct(camera), direct), "it has no noise"
+    rows = lambda image: image.reshape(3, -1).T.astype(float)
+    ours, directions, normal = rows(direct), rows(camera.view_directions()), rows(buffer["normal"])
+    place = camera.position + directions * (buffer["depth"].reshape(-1, 1) / (directions @ camera.rotation[:, 2:]))
+    (width, depth), y, parts = LIGHT["size"], LIGHT["height"], (np.arange(32) + 0.5) / 32 - 0.5
+    total, seen = np.zeros(len(place)), np.zeros(len(place))
+    for x in width * parts:
+        for z in depth * parts:
+            away = np.array([x, y, z]) - place
+            distance = np.linalg.norm(away, axis=1)
+            cosines = (away * normal).sum(1).clip(0) * away[:, 1] / distance**2
+            free = passes_crate(place + 1e-4 * normal, place + away)
+            total += free * cosines / distance**2 * width * depth / (np.pi * len(parts) ** 2)
+            seen += free / len(parts) ** 2
+    theirs = total[:, None] * LIGHT["radiance"]
+    whole, shadow, penumbra = seen == 1, seen == 0, (seen > 0) & (seen < 1)
+    assert whole.sum() > 400 and shadow.sum() > 20 and penumbra.sum() > 20
+    np.testing.assert_allclose(ours[whole], theirs[whole], rtol=0.1)
+    assert np.median(np.abs(ours[whole] / theirs[whole] - 1)) < 0.01
+    assert not ours[shadow].any()
+    unhindered = theirs[penumbra] / seen[penumbra, None]
+    assert (np.abs(ours[penumbra] - theirs[penumbra]) < 0.5 * unhindered).all()
+
+
+def test_direct_light_of_the_sky(tmp_path):
+    """A white floor under a sky of one colour reflects nearly that colour, and nothing in the dark."""
+    source = tmp_path / "scene.xml"
+    for radiance in ("0.2, 0.3, 0.4", "0, 0, 0"):
+        description = load_description(str(write_room(tmp_path, is_open=True, light=False)))
+        sky = f'<emitter type="constant"><rgb name="radiance" value="{radiance}"/></emitter></scene>'
+        source.write_text(source.read_text().replace("</scene>", sky))
+        camera = Camera.look_at(np.array([0.6, 1.0, -0.6]), np.array([0.6, 0, -0.5]), np.array([0, 1.0, 0]), 20, 8, 8)
+        direct = Renderer(Scene(description, "fixed_lights")).direct(camera)
+        expected = np.broadcast_to(np.float32(radiance.split(", "))[:, None, None], direct.shape)
+        np.testing.assert_allclose(direct, expected, rtol=0.3)
 
 
 # ---- G-buffer -------------------------------------------------------------------------------------------

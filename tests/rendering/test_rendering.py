@@ -221,7 +221,7 @@ def test_sparse_pixels(renderer, demo, monkeypatch):
 
 
 def test_window_of_an_image(renderer, demo):
-    """Radiance and G-buffer of a window are those of its pixels in the whole image."""
+    """Radiance, G-buffer and direct light of a window are those of its pixels in the whole image."""
     state = away("moving_lights", demo)
     renderer.scene.set_state(state)
     camera = sample_view(demo, 24, np.random.default_rng(4))
@@ -237,6 +237,7 @@ def test_window_of_an_image(renderer, demo):
         border = int(name == "albedo")  # a window does not know whether the albedo differs beyond its border
         seen = np.s_[:, border : 8 - border, border : 8 - border]
         np.testing.assert_allclose(values[seen], whole[name][inside][seen], rtol=1e-4, atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(renderer.direct(window), renderer.direct(camera)[inside], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(window.view_directions(), camera.view_directions()[inside], atol=1e-6)
 
 

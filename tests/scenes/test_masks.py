@@ -76,6 +76,19 @@ def test_gbuffer(tmp_path, masked, layers):
     assert np.allclose(buffer["normal"][:, ceiling].T, [0, -1, 0], atol=1e-5)
 
 
+def test_direct_light(tmp_path, masked):
+    """Shadow rays pass the sheet's transparent half as if nothing were there; the other half stops them."""
+    free = renderer_of(tmp_path, MASK, layers=0)
+    for side in (-1, 1):  # the walls before and behind which the sheet is transparent, and opaque
+        camera = Camera.look_at(np.array([0, 1.0, 0]), np.array([side, 1.0, 0]), np.array([0, 1.0, 0]), 60, 24, 20)
+        x, y, z = camera.view_directions()
+        height, aside = 1 + y / np.abs(x), z / np.abs(x)
+        wall = (np.abs(aside) < 0.99) & (height > 0.5) & (height < HEIGHT)  # whose rays to the lamp stay on its side
+        ours, unhindered = masked.direct(camera)[:, wall], free.direct(camera)[:, wall]
+        assert wall.sum() > 100 and unhindered.all()
+        np.testing.assert_allclose(ours, unhindered if side < 0 else 0, rtol=1e-4)
+
+
 def photons_at_sheet(renderer):
     """The height of each photon's hit; where its ray crosses the sheet's plane, for those that do so in the room."""
     photons = {name: values.astype(float) for name, values in renderer.photons(4000, 0).items()}
