@@ -70,13 +70,10 @@ class GuidedOneSample(NeuralField):
 
     def gbuffer(self, batch: Batch) -> Tensor:
         """Return the G-buffer, any field, and the noisy radiance without lamps in view, divided by the albedo."""
-        reflected = F.interpolate(log_exposed(self._reflected(batch), self._exposure(batch)), batch["depth"].shape[2:])
+        reflected = F.interpolate(log_exposed(self._reflected(batch), self.exposure(batch)), batch["depth"].shape[2:])
         return join_channels([super().gbuffer(batch), reflected])
 
-    def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
-        return super().to_radiance(batch | {"exposure": self._exposure(batch)}, channels)
-
-    def _exposure(self, batch: Batch) -> Tensor:
+    def exposure(self, batch: Batch) -> Tensor:
         """Return the scene's exposure (B,), or that which the noisy image itself asks for in each channel (B, 3)."""
         if not self.hparams["relative"]:
             return batch["exposure"]

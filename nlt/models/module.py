@@ -102,7 +102,8 @@ class RenderingModule(Method, L.LightningModule):
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
             direct_light: methods that read the G-buffer also read the direct light, which the renderer gives without
-                noise (`Renderer.direct`). Not in the paper.
+                noise (`Renderer.direct`); with "demodulated", the output adds albedo times direct light, so that the
+                network predicts the rest. Not in the paper.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
                 biases and the embeddings (nlt/models/muon.py).
@@ -193,7 +194,7 @@ class RenderingModule(Method, L.LightningModule):
         """Return depth, normal, albedo, view direction and, if chosen, direct light (B, 10 or 13, H, W)."""
         maps = [batch[name] for name in GBUFFER]
         if self.hparams["direct_light"]:
-            maps.append(log_exposed(batch["direct"], batch["exposure"]))
+            maps.append(log_exposed(batch["direct"], self.exposure(batch)))
         return join_channels(maps)
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
@@ -209,11 +210,18 @@ class RenderingModule(Method, L.LightningModule):
         The radiance is affine in the output either way, so Lemma 1 holds: the expected gradient for a noisy, unbiased
         target is the gradient for the noise-free one.
         """
+        unexpose = 1 / self.exposure(batch)
         if not self.demodulates:
-            return expose(channels, 1 / batch["exposure"])
+            return expose(channels, unexpose)
         scale, offset = channels.split(3, dim=1)
-        radiance = expose(batch["albedo"] * scale + offset, 1 / batch["exposure"])
+        radiance = expose(batch["albedo"] * scale + offset, unexpose)
+        if self.hparams["direct_light"]:
+            radiance = radiance + batch["albedo"] * batch["direct"]
         return radiance + batch["emission"] if self.hparams["add_emission"] else radiance
+
+    def exposure(self, batch: Batch) -> Tensor:
+        """Return the exposure (B,) or (B, 3) of the radiance that the U-Net reads and predicts: the scene's."""
+        return batch["exposure"]
 
     def steps(self) -> Steps:
         """Return the steps "transport", "projection" and "synthesis"."""

@@ -170,14 +170,17 @@ def test_a_mirrored_camera(method):
     torch.testing.assert_close(features(method, mirrored(batch)), features(method, batch).flip(-1))
 
 
+@pytest.mark.parametrize("direct_light", [False, True])
 @pytest.mark.parametrize("name", ["guided_1spp", "guided_1spp_relative"])
-def test_colour_and_brightness_of_the_light(name):
+def test_colour_and_brightness_of_the_light(name, direct_light):
     """The image of a relative denoiser is as linear in each channel of the light as light transport is; no other's."""
-    method = build(find_config("model", name), more={"output": "demodulated"} | SIZE).eval()
-    batch = synthetic_batch()
+    method = build(
+        find_config("model", name), more={"output": "demodulated", "direct_light": direct_light} | SIZE
+    ).eval()
+    batch, light = synthetic_batch(), ("noisy", "emission", "direct")
     factor = torch.tensor([0.1, 3.0, 40.0])[:, None, None]
-    brighter = batch | {field: batch[field] * factor for field in ("noisy", "emission")}
+    brighter = batch | {field: batch[field] * factor for field in light}
     expected = method(batch) * factor
     assert torch.allclose(method(brighter), expected, rtol=1e-3, atol=1e-4) == (name == "guided_1spp_relative")
-    black = method(batch | {field: torch.zeros_like(batch[field]) for field in ("noisy", "emission")})
+    black = method(batch | {field: torch.zeros_like(batch[field]) for field in light})
     assert black.isfinite().all()

@@ -24,6 +24,7 @@ from nlt.baselines.guided import GuidedOneSample
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.cli import main
 from nlt.config import read_configs
+from nlt.display import expose
 from nlt.errors import UserError
 from nlt.evaluation.comparison import build_if_untrained
 from nlt.models import factory, losses
@@ -145,7 +146,7 @@ def test_direct_light(config):
         brighter = method.features(batch | {"direct": batch["direct"] + 1}, method.transport(batch))
     changed = (features != brighter).any(0).any(-1).any(-1)
     assert changed.sum() == 3
-    expected = torch.log1p(batch["direct"] * batch["exposure"].view(-1, 1, 1, 1))
+    expected = torch.log1p(expose(batch["direct"], method.exposure(batch)))
     torch.testing.assert_close(features[:, changed], expected)
 
 

@@ -118,6 +118,9 @@ def test_a_demodulated_output():
     assert method.fields == (*method.inputs, "emission")
     dark = CNN(width=4, output="demodulated", add_emission=False)
     assert dark.fields == dark.inputs and not dark(batch).isnan().any()
+    direct = CNN(width=4, output="demodulated", direct_light=True)
+    direct.unet.forward = lambda *_: channels
+    torch.testing.assert_close(direct(batch), expected + batch["albedo"] * batch["direct"])
 
 
 def test_a_method_without_albedo_predicts_radiance():
