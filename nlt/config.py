@@ -32,6 +32,12 @@ def known(kind: str, name: str) -> str:
     return name
 
 
+def known_method(method: str) -> str:
+    """Return METHOD, or METHOD@VARIANT, if there is a config of each, for pydantic's validators."""
+    model, *variants = method.split("@", 1)
+    return "@".join([known("model", model), *(known("variant", variant) for variant in variants)])
+
+
 def read_configs(files: Sequence[str | Path], settings: Iterable[tuple[str, str]] = ()) -> dict[str, Any]:
     """Merge YAML configs, given by path or by name, for example "data/demo"; later ones override earlier ones.
 

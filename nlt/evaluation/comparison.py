@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, NonNegativeInt
 
-from nlt.config import Settings, known, parse, read_configs
+from nlt.config import Settings, known, known_method, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
@@ -21,13 +21,7 @@ from nlt.models.module import RenderingModule
 from nlt.paths import config_names, find_config
 from nlt.training import check_configs
 
-
-def _known_method(method: str) -> str:
-    model, *variants = method.split("@", 1)
-    return "@".join([known("model", model), *(known("variant", variant) for variant in variants)])
-
-
-_MethodName = Annotated[str, AfterValidator(_known_method)]
+_MethodName = Annotated[str, AfterValidator(known_method)]
 
 
 class _Content(Settings):

@@ -116,10 +116,10 @@ def advise(spec: DatasetSpec, facts: list[Facts]) -> list[Advice]:
     lights = listed(list(dict.fromkeys(name for fact in facts for name in fact.moving_lights)))
     moving = listed(list(dict.fromkeys(name for fact in facts for name in fact.moving)))
     if lights:
-        kind, methods = "photons", ["nlt_photons", "photon_splat"]
-        reason = f"lights move or are removed: {lights}; photons say where light arrives in each state"
+        kind, methods = "direct light or photons", ["cnn@direct", "nlt_photons"]
+        reason = f"lights move or are removed: {lights}; direct light and photons say where light arrives in each state"
     elif moving:
-        kind, methods = "points", ["nlt"]
+        kind, methods = "direct light or points", ["cnn@direct", "nlt"]
         reason = f"objects move or are removed: {moving}; no light does, so a network can learn where it arrives"
     else:
         kind, methods = "none", ["feature_projection", "cnn"]

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, field_validator
 from scipy.stats.qmc import Halton
 
-from nlt.config import Settings, known, merge, parse, read_configs
+from nlt.config import Settings, known, known_method, merge, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
@@ -38,12 +38,19 @@ class Candidate:
     @property
     def slug(self) -> str:
         """The candidate's name as a directory name."""
-        parts = (self.method.replace("/", "-"), Path(self.size).stem, self.num_points, self.num_photons)
+        parts = (
+            self.method.replace("/", "-").replace("@", "-"),
+            Path(self.size).stem,
+            self.num_points,
+            self.num_photons,
+        )
         return "-".join(str(part) for part in parts if part)
 
 
 class SearchSpace(Settings):
     """The candidates: every method in every size, with every number of points and of photons that it reads.
+
+    A method is METHOD, or METHOD@VARIANT, and `variant` is one more that all methods share, as in a comparison.
 
     `methods` and `sizes` go from the leanest to the largest, `point_counts` and `photon_counts` ascend; the last ones
     make the full model. `data` and `scale` are configs, and `name` is the file's unless it is given.
@@ -52,7 +59,8 @@ class SearchSpace(Settings):
     name: str
     data: str
     scale: str
-    methods: tuple[Annotated[str, AfterValidator(partial(known, "model"))], ...] = Field(min_length=1)
+    variant: Annotated[str, AfterValidator(partial(known, "variant"))] | None = None
+    methods: tuple[Annotated[str, AfterValidator(known_method)], ...] = Field(min_length=1)
     sizes: tuple[Annotated[str, AfterValidator(partial(known, "variant"))], ...] = Field(min_length=1)
     point_counts: tuple[PositiveInt, ...] = Field(min_length=1)
     photon_counts: tuple[PositiveInt, ...] = Field(min_length=1)
@@ -136,12 +144,14 @@ class SearchSpace(Settings):
         return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
 
     def _config(self, method: str, size: str) -> dict[str, Any]:
-        files = (("data", self.data), ("model", method), ("scale", self.scale), ("variant", size))
-        return read_configs([find_config(kind, name) for kind, name in files])
+        model, *own = method.split("@", 1)
+        variants = [find_config("variant", name) for name in (self.variant, *own, size) if name]
+        first = (("data", self.data), ("model", model), ("scale", self.scale))
+        return read_configs([*(find_config(kind, name) for kind, name in first), *variants])
 
     def build(self, candidate: Candidate) -> RenderingModule:
         """Return the candidate's untrained model."""
         sizes = {"num_scenes": len(self.spec.scenes), "num_points": self.spec.num_points}
-        module = build(self.config(candidate), find_config("model", candidate.method), **sizes)
+        module = build(self.config(candidate), find_config("model", candidate.method.partition("@")[0]), **sizes)
         assert isinstance(module, RenderingModule)
         return module

@@ -25,6 +25,7 @@ from nlt.data.engines import Process
 from nlt.data.generate import generate
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
+from nlt.errors import UserError
 from nlt.evaluation import clock
 from nlt.models.module import RenderingModule
 from nlt.models.nlt import NeuralLightTransport
@@ -73,7 +74,9 @@ def test_what_varies(built):
         mine = {key for key, value in objects.items() if emitting & set(value["shapes"])}
         assert set(lights) == (extra or mine), experiment
         verdict = advice.advise(DatasetSpec([name], experiment), [facts(moving, lights)])[0].verdict
-        assert verdict.partition(":")[0] == ("photons" if lights else "points" if moving else "none")
+        assert verdict.partition(":")[0] == (
+            "direct light or photons" if lights else "direct light or points" if moving else "none"
+        )
     points = sample_points(scenes["fixed_lights"], 200, 0)
     shares = advice.shares_of_materials(points)
     lobes = [mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyTransmission]
@@ -95,7 +98,7 @@ def test_advice_of_several_scenes():
     spec = DatasetSpec(["egg", "kitchen"], num_points=4096, num_photons=300)
     some = [facts(["cup"]), facts(["lamp", "cup"], ["lamp"], {"diffuse": 0.5, "mirror": 0.5})]
     transport, direction, *_ = advice.advise(spec, some)
-    assert transport.verdict.startswith("photons") and "lamp" in transport.reason and "cup" not in transport.reason
+    assert "photons" in transport.verdict and "lamp" in transport.reason and "cup" not in transport.reason
     assert direction.verdict == "needed" and "mirror 25" in direction.reason
     assert advice.advise(spec, some[:1])[1].verdict.startswith("not needed")
     text = advice.table(advice.advise(spec, some), some)
@@ -381,6 +384,20 @@ def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
     finals = [row for row in run_select(space) if row["steps"] == str(STEPS)]
     assert len(finals) == 3 and any(row["full"] == "1" for row in finals)
     assert sum(row["method"] == "cnn" for row in finals) == (0 if lights else 1)
+
+
+def test_variants(space, tmp_path):
+    """A method with a variant of its own, and a variant of all methods; the size still has the last word."""
+    content = yaml.safe_load(space.read_text())
+    content |= {"methods": ["cnn", "cnn@direct"], "variant": "demodulated"}
+    read = SearchSpace.load(str(write(tmp_path / "variants.yaml", content)))
+    plain, direct = (next(c for c in read.candidates if c.method == name) for name in content["methods"])
+    assert direct.name == f"cnn@direct@{Path(direct.size).stem}" and plain.slug != direct.slug
+    for candidate, is_direct in ((plain, False), (direct, True)):
+        model = read.build(candidate)
+        assert model.hparams["output"] == "demodulated" and model.hparams["direct_light"] == is_direct
+    with pytest.raises(UserError, match=r"methods\.0: no variant 'dirct'"):
+        SearchSpace.load(str(write(tmp_path / "variants.yaml", content | {"methods": ["cnn@dirct"]})))
 
 
 def test_frames_are_timed_in_a_process(space):
