@@ -15,6 +15,7 @@ from generated import spec_of
 from PIL import Image
 from tiny import write
 
+from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.guided import GuidedOneSample
 from nlt.baselines.path_tracing import OpenImageDenoise
@@ -263,6 +264,15 @@ def test_without_noisy_input_nothing_is_traced(models, monkeypatch):
     with torch.no_grad():
         model.frame(moment, view)
     assert not traced and {"gbuffer", "photons", "projection", "synthesis"} <= model.seconds.keys()
+
+
+def test_direct_light_is_that_of_the_view(models):
+    model = ModelRenderer(CNN(width=2, direct_light=True), load_trained(str(models.splat))[1], 0, CPU)
+    description = model.render.description
+    (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
+    direct = model.batch(moment, view)["direct"][0].numpy()
+    np.testing.assert_array_equal(direct, model.render.renderer.direct(view))
+    assert direct.any() and "direct_light" in model.seconds and model.frame(moment, view).isfinite().all()
 
 
 def test_checkpoint_export_and_video(tiny, checkpoint, tmp_path, capsys):
