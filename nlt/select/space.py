@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -38,12 +39,8 @@ class Candidate:
     @property
     def slug(self) -> str:
         """The candidate's name as a directory name."""
-        parts = (
-            self.method.replace("/", "-").replace("@", "-"),
-            Path(self.size).stem,
-            self.num_points,
-            self.num_photons,
-        )
+        method = re.sub("[/@]", "-", self.method)
+        parts = (method, Path(self.size).stem, self.num_points, self.num_photons)
         return "-".join(str(part) for part in parts if part)
 
 
