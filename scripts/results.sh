@@ -38,6 +38,10 @@ if [ "$scale" = small ]; then
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    room --config front --scale medium --out results/direct_256 \
+        --methods cnn cnn@direct field field@direct guided_1spp guided_1spp@direct guided_1spp_1_4@direct \
+        guided_1spp_1_16@direct guided_1spp_field guided_1spp_field@direct \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
@@ -57,8 +61,7 @@ if [ "$scale" = small ]; then
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
         --methods cnn cnn@before cnn@images_6400 nlt_photons nlt_photons@before photons_only@images_6400 oidn_1 oidn_4
     room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
-        --methods cnn guided_1spp guided_1spp_field photons_only field photon_field \
-        oidn_1 oidn_4 oidn_1_balanced oidn_1_fast path_tracing_1 path_tracing_4
+        --methods $table2 cnn@before nlt_photons@before guided_1spp guided_1spp_field photons_only field photon_field
     room --config front --scale any_room --out results/any_room \
         --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
     once python benchmarks/leaner.py --seeds 2
