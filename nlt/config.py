@@ -38,6 +38,13 @@ def known_method(method: str) -> str:
     return "@".join([known("model", model), *(known("variant", variant) for variant in variants)])
 
 
+def method_files(data: str, method: str, scale: str, variant: str | None) -> list[Path]:
+    """Return the configs of METHOD or METHOD@VARIANT, to be read in this order; `variant` is one that methods share."""
+    model, _, own_variant = method.partition("@")
+    kinds = (("data", data), ("model", model), ("scale", scale), ("variant", variant), ("variant", own_variant))
+    return [paths.find_config(kind, name) for kind, name in kinds if name]
+
+
 def read_configs(files: Sequence[str | Path], settings: Iterable[tuple[str, str]] = ()) -> dict[str, Any]:
     """Merge YAML configs, given by path or by name, for example "data/demo"; later ones override earlier ones.
 

@@ -76,7 +76,7 @@ class GuidedOneSample(NeuralField):
     def exposure(self, batch: Batch) -> Tensor:
         """Return the scene's exposure (B,), or that which the noisy image itself asks for in each channel (B, 3)."""
         if not self.hparams["relative"]:
-            return batch["exposure"]
+            return super().exposure(batch)
         # This mean grows in proportion to the light, as the usual one does, but a firefly hardly changes it.
         mean = self._reflected(batch).sqrt().mean((2, 3)) ** 2
         return 1 / mean.clamp(min=_DARKEST)

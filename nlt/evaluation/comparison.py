@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, NonNegativeInt
 
-from nlt.config import Settings, known, known_method, parse, read_configs
+from nlt.config import Settings, known, known_method, method_files, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
@@ -96,9 +96,7 @@ class Comparison:
             raise UserError(f"--train-images: {most}; give at most {spec.train}")
         files = {}
         for method in sorted(content.methods or all_methods(), key=order):
-            model, _, own_variant = method.partition("@")
-            variants = [find_config("variant", name) for name in (content.variant, own_variant) if name]
-            files[method] = [data_file, find_config("model", model), scale_file, *variants]
+            files[method] = method_files(content.data, method, content.scale, content.variant)
         seed_list = list(range(content.seed, content.seed + seeds))
         found = cls(
             full_name, spec, root, files, seed_list, scale_file, content.variant, content.table, precision,

@@ -48,7 +48,7 @@ def select(config: str, minutes: float | None = None, out: str | None = None, on
     write_bytes(directory / "advice.md", advice.table(advised, facts).encode())
     dataset = generate(space.spec, space.root)
     methods = [method for item in advised for method in item.methods]
-    search = Search(space, dataset, Path("runs") / dataset.name / "select" / (space.variant or ""), methods)
+    search = Search(space, dataset, Path("runs") / dataset.name / "select" / Path(space.variant or "").stem, methods)
     finals = search.run()
     times = {c: float(search.entries[c].cost["time_per_frame_s"]) for c in finals}
     parameters = {c: float(search.entries[c].cost["parameters"]) for c in finals}

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, field_validator
 from scipy.stats.qmc import Halton
 
-from nlt.config import Settings, known, known_method, merge, parse, read_configs
+from nlt.config import Settings, known, known_method, merge, method_files, parse, read_configs
 from nlt.data.files import AnyPath
 from nlt.data.spec import DatasetSpec, load_spec
 from nlt.errors import UserError
@@ -141,10 +141,8 @@ class SearchSpace(Settings):
         return merge(self._config(candidate.method, candidate.size), {"model": {"init_args": limits}})
 
     def _config(self, method: str, size: str) -> dict[str, Any]:
-        model, *own = method.split("@", 1)
-        variants = [find_config("variant", name) for name in (self.variant, *own, size) if name]
-        first = (("data", self.data), ("model", model), ("scale", self.scale))
-        return read_configs([*(find_config(kind, name) for kind, name in first), *variants])
+        files = method_files(self.data, method, self.scale, self.variant)
+        return read_configs([*files, find_config("variant", size)])
 
     def build(self, candidate: Candidate) -> RenderingModule:
         """Return the candidate's untrained model."""

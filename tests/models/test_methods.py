@@ -109,6 +109,16 @@ def test_bfloat16_autocast(method):
     torch.testing.assert_close(mixed, method(batch), rtol=0.05, atol=0.05)
 
 
+def test_stages_are_those_of_the_inputs(method):
+    photons = any(name.startswith("photon_") for name in method.inputs)
+    stages = {
+        "gbuffer": not {"depth", "normal"}.isdisjoint(method.inputs),
+        "photons": photons,
+        "path_tracing": method.pixel_fraction > 0,
+    }
+    assert method.stages == tuple(stage for stage, needed in stages.items() if needed)
+
+
 @pytest.mark.parametrize(
     ("name", "stages"),
     {
@@ -125,7 +135,7 @@ def test_bfloat16_autocast(method):
         "ablation_1": ("gbuffer",),
     }.items(),
 )
-def test_stages_are_those_of_the_inputs(name, stages):
+def test_stages(name, stages):
     assert build(find_config("model", name)).stages == stages
 
 
