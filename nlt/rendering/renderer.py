@@ -27,8 +27,8 @@ _PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
 _MOST_CASTS = 1024  # per requested photon
 _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
 _ALBEDO_SIDE, _EMISSION_SIDE = 2, 4  # They are means over so many rays squared in each pixel.
-# Direct light is a sum over so many shadow rays squared to each emitter: in a room, and where there is a sky.
-_DIRECT_SIDE, _DIRECT_SIDE_OF_SKY = 2, 4
+# Shadow rays to each emitter: where all lamps are flat, and where not. Powers of two spread evenly.
+_SHADOW_RAYS_FLAT, _SHADOW_RAYS = 4, 16
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
@@ -153,12 +153,14 @@ class Renderer:
     def direct(self, camera: Camera) -> np.ndarray:
         """Return the radiance (3, H, W) that a white diffuse surface at each pixel's centre would reflect of the lamps.
 
-        Shadow rays go to four fixed points of each lamp; with an environment, to 16 of each lamp and in 16 directions.
-        So there is no noise, and a penumbra has a few shades. Like primary rays, they pass through opacity masks.
+        Shadow rays go to four fixed points of each lamp. There are 16 if any lamp has more than two triangles, because
+        some face away, or with an environment, which gets as many. So there is no noise, and a penumbra has a few
+        shades. Like primary rays, shadow rays pass through opacity masks.
         """
         lanes = {"corner": ("Point2f", np.floor(camera.centres()).astype(np.float32))}
-        fixed = {"masks": self.scene.masks, "emitters": len(self.emitters), **self._camera_values(camera)}
-        fixed["side"] = _DIRECT_SIDE if self.scene.environment is None else _DIRECT_SIDE_OF_SKY
+        fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
+        is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
+        fixed["rays"] = len(self.emitters) * (_SHADOW_RAYS_FLAT if is_flat else _SHADOW_RAYS)
         (direct,) = launch(self._direct, lanes, **fixed)
         return direct.T.reshape(3, camera.height, camera.width)
 
@@ -340,13 +342,13 @@ def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any
     return total / side**2
 
 
-def _direct(scene: Any, masks: bool, emitters: int, side: int, corner: Any, **camera: Any) -> tuple:
+def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> tuple:
     surface = first_surface(scene, _ray(corner + 0.5, **camera), masks)
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
-    columns = emitters * side  # The first coordinate of a sample also chooses the emitter.
 
     def step(k: Any, total: Any) -> tuple:
-        place = mi.Point2f((mi.Float(k % columns) + 0.5) / columns, (mi.Float(k // columns) + 0.5) / side)
+        # Hammersley's points; the first coordinate also chooses the emitter, and the triangle of a mesh.
+        place = mi.Point2f((mi.Float(k) + 0.5) / rays, mi.radical_inverse_2(k, 0) + 0.5 / rays)
         lamp, radiance = scene.sample_emitter_direction(surface, place, not masks, surface.is_valid())
         if masks:
             ray = surface.spawn_ray_to(lamp.p)
@@ -354,8 +356,8 @@ def _direct(scene: Any, masks: bool, emitters: int, side: int, corner: Any, **ca
         return k + 1, total + mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0)
 
     state = (mi.UInt32(0), mi.Color3f(0))
-    _, total = dr.while_loop(state, lambda k, total: surface.is_valid() & (k < columns * side), step)
-    return (total / (columns * side * dr.pi),)
+    _, total = dr.while_loop(state, lambda k, total: surface.is_valid() & (k < rays), step)
+    return (total / (rays * dr.pi),)
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:

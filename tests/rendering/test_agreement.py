@@ -5,6 +5,7 @@ and `noisy` with the reference.
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from conftest import LIGHT, plain_scene, write_room
 from scipy import ndimage, stats
 from torch.utils.data import default_collate
@@ -162,6 +163,20 @@ def test_direct_light_of_the_sky(tmp_path):
         direct = Renderer(Scene(description, "fixed_lights")).direct(camera)
         expected = np.broadcast_to(np.float32(radiance.split(", "))[:, None, None], direct.shape)
         np.testing.assert_allclose(direct, expected, rtol=0.3)
+
+
+def test_direct_light_of_a_bulb(tmp_path):
+    """A mesh of a sphere lights the floor within 40 % of a sphere, although half faces away: radiance (r / d)^2 cos."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    bulb = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    bulb.apply_translation([0, 1.5, 0]).export(tmp_path / "lamp.ply")
+    camera = Camera.look_at(np.array([0.6, 1.0, -0.5]), np.array([0.5, 0, -0.6]), np.array([0, 1.0, 0]), 30, 8, 8)
+    renderer = Renderer(Scene(description, "fixed_lights"))
+    depth, directions = renderer.gbuffer(camera)["depth"].reshape(-1, 1), camera.view_directions().reshape(3, -1).T
+    place = camera.position + directions * (depth / (directions @ camera.rotation[:, 2:]))
+    distance = np.linalg.norm(place - [0, 1.5, 0], axis=1)
+    expected = np.outer(LIGHT["radiance"], 0.1**2 * 1.5 / distance**3)
+    np.testing.assert_allclose(renderer.direct(camera).reshape(3, -1), expected, rtol=0.4)
 
 
 # ---- G-buffer -------------------------------------------------------------------------------------------
