@@ -56,6 +56,11 @@ done
 once nlt stress --config table2_real --scale "$scale" --views 1
 if [ "$scale" = small ]; then
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/recipe
+    parts=
+    for method in feature_projection nlt photons_only guided_1_1; do
+        parts="$parts $method $method@radiance $method@paper_schedule $method@adam"
+    done
+    once nlt compare --config recipe --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/narrow \
         --methods cnn cnn@narrow nlt_photons nlt_photons@narrow guided_1_1 guided_1_1@narrow oidn_1 oidn_4
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
