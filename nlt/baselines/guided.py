@@ -83,7 +83,7 @@ class GuidedOneSample(NeuralField):
 
     def _reflected(self, batch: Batch) -> Tensor:
         """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, rows, columns)."""
-        noisy, emission, albedo = (self._traced(batch[name]) for name in ("noisy", "emission", "albedo"))
+        noisy, emission, albedo = map(self._traced, (batch["noisy"], batch["emission"], self.albedo(batch)))
         return (noisy - emission).clamp(min=0) / (albedo + _LEAST_ALBEDO)
 
     def _traced(self, image: Tensor) -> Tensor:

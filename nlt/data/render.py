@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection
 import drjit as dr
 import numpy as np
 
-from nlt.data.sample import BUFFERS, FIELDS
+from nlt.data.sample import BUFFERS, DIRECT, FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.errors import UserError
 from nlt.rendering.renderer import Renderer
@@ -91,8 +91,8 @@ class SampleRenderer:
         sample |= {name: self.radiance(camera, *image) for name, image in images.items() if name in fields}
         if not fields.keys().isdisjoint(BUFFERS):
             sample |= self.renderer.gbuffer(camera)
-        if "direct" in fields:
-            sample["direct"] = self.renderer.direct(camera)
+        if not fields.keys().isdisjoint(DIRECT):
+            sample |= self.renderer.direct(camera)
         if any(name.startswith("photon_") for name in fields):
             sample |= self.renderer.photons(spec.num_photons, photons)
         return {

@@ -17,7 +17,7 @@ import numpy as np
 
 from nlt.scenes.description import MATERIALS
 
-__all__ = ["BATCH_FIELDS", "BUFFERS", "FIELDS", "MATERIALS", "POINT_FIELDS", "SPLITS", "Field"]
+__all__ = ["BATCH_FIELDS", "BUFFERS", "DIRECT", "FIELDS", "MATERIALS", "POINT_FIELDS", "SPLITS", "Field"]
 
 SPLITS = ("train", "val", "test")
 
@@ -62,7 +62,14 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "radiance that a white diffuse surface at the pixel centre would reflect of direct light; noise-free",
+        "radiance that a white diffuse surface at the pixel centre, or seen in a mirror or through clear glass there, "
+        "would reflect of direct light; noise-free",
+    ),
+    "mirrored_albedo": Field(
+        (3, "H", "W"),
+        "float16",
+        "1",
+        "albedo of the surface seen in a mirror or through clear glass, times what these let pass; elsewhere 0",
     ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, maps view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, maps world space to view space; a rigid transform"),
@@ -77,6 +84,7 @@ FIELDS: dict[str, Field] = {
 
 TRACED = ("noisy", "noisy_input")  # fields that path tracing gives and a method may read
 BUFFERS = ("depth", "normal", "albedo", "emission")  # fields that one noise-free pass of primary rays gives
+DIRECT = ("direct", "mirrored_albedo")  # fields that shadow rays give
 
 POINT_FIELDS: dict[str, Field] = {
     "position": Field(("N", 3), "float32", "m", "position with every object at its place in the scene file"),

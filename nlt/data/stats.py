@@ -15,7 +15,7 @@ from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB, TIMED_SPP, timed_spp
 from nlt.data.render import SampleRenderer
-from nlt.data.sample import BUFFERS, FIELDS
+from nlt.data.sample import BUFFERS, DIRECT, FIELDS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
@@ -27,7 +27,7 @@ STAGES = {
     "noisy": ("noisy",),
     "noisy_input": ("noisy_input",),
     "G-buffer": BUFFERS,
-    "direct light": ("direct",),
+    "direct light": DIRECT,
     "photons": ("photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid"),
     "reference": ("reference_a", "reference_b"),
     "storing": (),

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlt.data.sample import BUFFERS, TRACED
+from nlt.data.sample import BUFFERS, DIRECT, TRACED
 
 Batch = dict[str, Tensor]
 
@@ -35,7 +35,7 @@ class Method(nn.Module):
         """The renderer stages that a frame needs, out of "gbuffer", "direct_light", "photons" and "path_tracing"."""
         stages = {
             "gbuffer": self._reads(*BUFFERS),
-            "direct_light": self._reads("direct"),
+            "direct_light": self._reads(*DIRECT),
             "photons": any(name.startswith("photon_") for name in self.inputs),
             "path_tracing": self.pixel_fraction > 0,
         }

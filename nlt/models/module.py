@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
 
+from nlt.data.sample import DIRECT
 from nlt.display import expose
 from nlt.errors import DivergedError, UserError
 from nlt.metrics.image_metrics import ImageMetrics
@@ -101,9 +102,9 @@ class RenderingModule(Method, L.LightningModule):
                 as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
-            direct_light: methods that read the G-buffer also read the direct light, which the renderer gives without
-                noise (`Renderer.direct`); with "demodulated", the output adds albedo times direct light, so that the
-                network predicts the rest. Not in the paper.
+            direct_light: methods that read the G-buffer also read the direct light and the albedo of what mirrors and
+                clear glass show, which the renderer gives without noise (`Renderer.direct`); with "demodulated", the
+                output adds albedo times direct light, so that the network predicts the rest. Not in the paper.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
                 biases and the embeddings (nlt/models/muon.py).
@@ -183,19 +184,23 @@ class RenderingModule(Method, L.LightningModule):
     @property
     def gbuffer_inputs(self) -> tuple[str, ...]:
         """The batch fields that `gbuffer` reads."""
-        return (*GBUFFER, "direct") if self.hparams["direct_light"] else GBUFFER
+        return (*GBUFFER, *DIRECT) if self.hparams["direct_light"] else GBUFFER
 
     @property
     def gbuffer_channels(self) -> int:
         """The number of channels that `gbuffer` returns."""
-        return 13 if self.hparams["direct_light"] else 10
+        return 16 if self.hparams["direct_light"] else 10
 
     def gbuffer(self, batch: Batch) -> Tensor:
-        """Return depth, normal, albedo, view direction and, if chosen, direct light (B, 10 or 13, H, W)."""
+        """Return the maps of `GBUFFER` and, if chosen, of direct light (B, 10 or 16, H, W)."""
         maps = [batch[name] for name in GBUFFER]
         if self.hparams["direct_light"]:
-            maps.append(log_exposed(batch["direct"], self.exposure(batch)))
+            maps += [log_exposed(batch["direct"], self.exposure(batch)), batch["mirrored_albedo"]]
         return join_channels(maps)
+
+    def albedo(self, batch: Batch) -> Tensor:
+        """Return the albedo (B, 3, H, W); with direct light, that of what mirrors and clear glass show, too."""
+        return batch["albedo"] + batch["mirrored_albedo"] if self.hparams["direct_light"] else batch["albedo"]
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""
@@ -214,9 +219,10 @@ class RenderingModule(Method, L.LightningModule):
         if not self.demodulates:
             return expose(channels, unexpose)
         scale, offset = channels.split(3, dim=1)
-        radiance = expose(batch["albedo"] * scale + offset, unexpose)
+        albedo = self.albedo(batch)
+        radiance = expose(albedo * scale + offset, unexpose)
         if self.hparams["direct_light"]:
-            radiance = radiance + batch["albedo"] * batch["direct"]
+            radiance = radiance + albedo * batch["direct"]
         return radiance + batch["emission"] if self.hparams["add_emission"] else radiance
 
     def exposure(self, batch: Batch) -> Tensor:

@@ -6,6 +6,7 @@ All results are numpy arrays in metres, world coordinates and linear, unclamped 
 import itertools
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,7 @@ _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wa
 _ALBEDO_SIDE, _EMISSION_SIDE = 2, 4  # They are means over so many rays squared in each pixel.
 # Shadow rays to each emitter: where all lamps are flat, and where not. Powers of two spread evenly.
 _SHADOW_RAYS_FLAT, _SHADOW_RAYS = 4, 16
+_MOST_MIRRORS = 8  # A ray is followed through at most so many mirrors and panes of glass.
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
@@ -150,19 +152,24 @@ class Renderer:
         buffers |= {"albedo": albedo, "emission": emission}
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
-    def direct(self, camera: Camera) -> np.ndarray:
-        """Return the radiance (3, H, W) that a white diffuse surface at each pixel's centre would reflect of the lamps.
+    def direct(self, camera: Camera) -> dict[str, np.ndarray]:
+        """Trace shadow rays from what is seen at each pixel's centre, in mirrors and behind clear glass, too.
 
         Shadow rays go to four fixed points of each lamp. There are 16 if any lamp has more than two triangles, because
         some face away, or with an environment, which gets as many. So there is no noise, and a penumbra has a few
         shades. Like primary rays, shadow rays pass through opacity masks.
+
+        Returns:
+            direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps; and
+            mirrored_albedo (3, H, W), the albedo there times what mirrors and glass on the way let pass, or 0 where
+            there are none. A lamp in a mirror is a white surface that reflects what it emits.
         """
         lanes = {"corner": ("Point2f", np.floor(camera.centres()).astype(np.float32))}
         fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
         is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
         fixed["rays"] = len(self.emitters) * (_SHADOW_RAYS_FLAT if is_flat else _SHADOW_RAYS)
-        (direct,) = launch(self._direct, lanes, **fixed)
-        return direct.T.reshape(3, camera.height, camera.width)
+        images = [image.T.reshape(3, camera.height, camera.width) for image in launch(self._direct, lanes, **fixed)]
+        return dict(zip(("direct", "mirrored_albedo"), images, strict=True))
 
     def _may_see_lamp(self, camera: Camera) -> np.ndarray:
         """Return (H W,) bool: the pixels that cover part of a lamp's bounding box. No others have a lamp's emission."""
@@ -298,11 +305,13 @@ def _gbuffer(scene: Any, masks: bool, sky: bool, corner: Any, lit: Any, size: An
     albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
     lit = (lit > 0) | (escapes & sky)
 
-    def emission(interaction: Any) -> Any:
-        emitter = interaction.emitter(scene)  # the environment if the ray escapes
-        return mi.Color3f(0) if emitter is None else mi.Color3f(emitter.eval(interaction))
+    emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_SIDE, lit)
+    return centre.p, centre.sh_frame.n, albedo, emission, valid
 
-    return centre.p, centre.sh_frame.n, albedo, _pixel_mean(trace, emission, _EMISSION_SIDE, lit), valid
+
+def _emission(scene: Any, interaction: Any) -> Any:
+    emitter = interaction.emitter(scene)  # the environment if the ray escapes
+    return mi.Color3f(0) if emitter is None else mi.Color3f(emitter.eval(interaction))
 
 
 def _albedo(interaction: Any) -> Any:
@@ -343,12 +352,12 @@ def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any
 
 
 def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> tuple:
-    surface = first_surface(scene, _ray(corner + 0.5, **camera), masks)
+    surface, tint, bounces = _through_mirrors(scene, _ray(corner + 0.5, **camera), masks)
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
 
     def step(k: Any, total: Any) -> tuple:
         # Hammersley's points; the first coordinate also chooses the emitter, and the triangle of a mesh.
-        place = mi.Point2f((mi.Float(k) + 0.5) / rays, mi.radical_inverse_2(k, 0) + 0.5 / rays)
+        place = mi.Point2f((mi.Float(k) + 0.5) / rays, mi.radical_inverse_2(k, mi.UInt32(0)) + 0.5 / rays)
         lamp, radiance = scene.sample_emitter_direction(surface, place, not masks, surface.is_valid())
         if masks:
             ray = surface.spawn_ray_to(lamp.p)
@@ -357,7 +366,31 @@ def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> t
 
     state = (mi.UInt32(0), mi.Color3f(0))
     _, total = dr.while_loop(state, lambda k, total: surface.is_valid() & (k < rays), step)
-    return (total / (rays * dr.pi),)
+    emission = _emission(scene, surface)
+    is_lamp = (bounces > 0) & dr.any(emission > 0)
+    albedo = dr.select(bounces > 0, tint * dr.select(is_lamp, 1, _albedo(surface)), 0)
+    return dr.select(is_lamp, emission, total / (rays * dr.pi)), albedo
+
+
+def _through_mirrors(scene: Any, ray: Any, masks: bool) -> tuple[Any, Any, Any]:
+    """Follow a ray in mirrors and through clear glass, where it always passes, to the first other surface.
+
+    Returns the interaction there, the share of its radiance that arrives by way of them, and their number.
+    """
+
+    def is_clear(surface: Any, tint: Any, bounces: Any) -> Any:
+        if not is_jit() and not surface.is_valid():
+            return False  # A scalar ray that misses has no BSDF.
+        flags = surface.bsdf().flags()
+        return surface.is_valid() & (flags != 0) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth) & (bounces < _MOST_MIRRORS)
+
+    def step(surface: Any, tint: Any, bounces: Any) -> tuple:
+        # A dielectric reflects if the first number is below its reflectance.
+        sample, weight = surface.bsdf().sample(mi.BSDFContext(), surface, mi.Float(0.9999), mi.Point2f(0.5))
+        onward = surface.spawn_ray(surface.to_world(sample.wo))
+        return first_surface(scene, onward, masks), tint * mi.Color3f(weight), bounces + 1
+
+    return dr.while_loop((first_surface(scene, ray, masks), mi.Color3f(1), mi.UInt32(0)), is_clear, step)
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:

@@ -14,7 +14,7 @@ from torch import Tensor
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.data.dataset import SampleTensors, collate
 from nlt.data.render import SampleRenderer
-from nlt.data.sample import BUFFERS, TRACED
+from nlt.data.sample import BUFFERS, DIRECT, TRACED
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import Points
 from nlt.errors import UserError
@@ -90,9 +90,9 @@ class ModelRenderer:
             self._key = state.key
         with self.stage("gbuffer"):
             view = self.render.view(camera, self._seeds, {*(names & {*BUFFERS}), "camera_matrix", "world_to_view"})
-        if "direct" in names:
+        if direct := names & {*DIRECT}:
             with self.stage("direct_light"):
-                view |= self.render.view(camera, self._seeds, {"direct"})
+                view |= self.render.view(camera, self._seeds, direct)
         if traced:
             with self.stage("path_tracing"):
                 view |= self.render.view(camera, seeds, traced)

@@ -144,12 +144,12 @@ DIRECT = [path for path in CONFIGS if not path.stem.startswith(("denoising", "ab
 
 @pytest.mark.parametrize("config", DIRECT, ids=lambda path: path.stem)
 def test_direct_light(config):
-    """A switch of every method that reads the G-buffer: three more channels, one more stage."""
+    """A switch of every method that reads the G-buffer: six more channels, one more stage."""
     batch, without = synthetic_batch(), build(config)
     method = build(config, find_config("variant", "direct")).eval()
-    assert {*method.inputs} - {*without.inputs} == {"direct"}
+    assert {*method.inputs} - {*without.inputs} == {"direct", "mirrored_albedo"}
     assert [stage for stage in method.stages if stage != "direct_light"] == [*without.stages]
-    assert method.feature_channels == without.feature_channels + 3
+    assert method.feature_channels == without.feature_channels + 6
     with torch.no_grad():
         features = method.features(batch, method.transport(batch))
         assert features.shape[1] == method.feature_channels
