@@ -357,7 +357,8 @@ def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> t
 
     def step(k: Any, total: Any) -> tuple:
         # Hammersley's points; the first coordinate also chooses the emitter, and the triangle of a mesh.
-        place = mi.Point2f((mi.Float(k) + 0.5) / rays, mi.radical_inverse_2(k, mi.UInt32(0)) + 0.5 / rays)
+        second = mi.radical_inverse_2(k, mi.UInt32(0))  # type: ignore[arg-type]
+        place = mi.Point2f((mi.Float(k) + 0.5) / rays, second + 0.5 / rays)
         lamp, radiance = scene.sample_emitter_direction(surface, place, not masks, surface.is_valid())
         if masks:
             ray = surface.spawn_ray_to(lamp.p)
@@ -382,7 +383,8 @@ def _through_mirrors(scene: Any, ray: Any, masks: bool) -> tuple[Any, Any, Any]:
         if not is_jit() and not surface.is_valid():
             return False  # A scalar ray that misses has no BSDF.
         flags = surface.bsdf().flags()
-        return surface.is_valid() & (flags != 0) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth) & (bounces < _MOST_MIRRORS)
+        only_deltas = (flags != 0) & (flags & int(mi.BSDFFlags.Smooth) == 0)  # "Smooth" are all lobes but deltas.
+        return surface.is_valid() & only_deltas & (bounces < _MOST_MIRRORS)
 
     def step(surface: Any, tint: Any, bounces: Any) -> tuple:
         # A dielectric reflects if the first number is below its reflectance.
