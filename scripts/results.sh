@@ -42,6 +42,8 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@direct field field@direct guided_1spp guided_1spp@direct guided_1spp_1_4@direct \
         guided_1spp_1_16@direct guided_1spp_field guided_1spp_field@direct \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    room --config front --scale demo --methods cnn cnn@direct guided_1spp guided_1spp@direct oidn_1 oidn_4 \
+        --out results/mirrors
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
