@@ -39,8 +39,8 @@ if [ "$scale" = small ]; then
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --out results/direct_256 \
-        --methods cnn cnn@direct field field@direct guided_1spp guided_1spp@direct guided_1spp_1_4@direct \
-        guided_1spp_1_16@direct guided_1spp_field guided_1spp_field@direct \
+        --methods cnn cnn@direct cnn@direct_other_rooms field field@direct guided_1spp guided_1spp@direct \
+        guided_1spp@direct_other_rooms guided_1spp@direct_fine_tuned_400 guided_1spp_1_4@direct guided_1spp_1_16@direct guided_1spp_field guided_1spp_field@direct \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale demo --methods cnn cnn@direct guided_1spp guided_1spp@direct oidn_1 oidn_4 \
         --out results/mirrors
