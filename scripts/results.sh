@@ -40,8 +40,12 @@ if [ "$scale" = small ]; then
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --out results/direct_256 \
         --methods cnn cnn@direct cnn@direct_other_rooms field field@direct guided_1spp guided_1spp@direct \
-        guided_1spp@direct_other_rooms guided_1spp@direct_fine_tuned_400 guided_1spp_1_4@direct guided_1spp_1_16@direct guided_1spp_field guided_1spp_field@direct \
+        guided_1spp@direct_other_rooms guided_1spp@direct_fine_tuned_400 guided_1spp_1_4@direct guided_1spp_1_16@direct \
+        guided_1spp_field guided_1spp_field@direct \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    once python scripts/teaser.py results/direct_256 --view 8 \
+        --methods path_tracing_1 cnn@direct guided_1spp@direct oidn_1_balanced oidn_1
+    once nlt compare --config demo --out results/demo_direct
     room --config front --scale demo --methods cnn cnn@direct guided_1spp guided_1spp@direct oidn_1 oidn_4 \
         --out results/mirrors
     room --config other_rooms --scale medium --out results/other_rooms

@@ -153,11 +153,11 @@ class Renderer:
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
     def direct(self, camera: Camera) -> dict[str, np.ndarray]:
-        """Trace shadow rays from what is seen at each pixel's centre, in mirrors and behind clear glass, too.
+        """Trace shadow rays from the surface at each pixel's centre, or from the one that a mirror or pane shows there.
 
-        Shadow rays go to four fixed points of each lamp. There are 16 if any lamp has more than two triangles, because
-        some face away, or with an environment, which gets as many. So there is no noise, and a penumbra has a few
-        shades. Like primary rays, shadow rays pass through opacity masks.
+        Shadow rays go to four fixed points of each lamp; to 16 if there is an environment, which gets as many, or a
+        lamp of more than two triangles, of which some face away. So there is no noise, and a penumbra has a few shades.
+        Like primary rays, shadow rays pass through opacity masks.
 
         Returns:
             direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps; and
@@ -374,9 +374,10 @@ def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> t
 
 
 def _through_mirrors(scene: Any, ray: Any, masks: bool) -> tuple[Any, Any, Any]:
-    """Follow a ray in mirrors and through clear glass, where it always passes, to the first other surface.
+    """Follow a ray to the first surface that is no mirror or clear glass; it passes glass where it can.
 
-    Returns the interaction there, the share of its radiance that arrives by way of them, and their number.
+    Returns the interaction there, the share of its radiance that reaches the camera, and the number of mirrors and
+    panes on the way.
     """
 
     def is_clear(surface: Any, tint: Any, bounces: Any) -> Any:
