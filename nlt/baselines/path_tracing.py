@@ -15,12 +15,14 @@ Quality = Literal["fast", "balanced", "high"]
 class PathTracing(Method):
     """Path tracing of every pixel at `spp` samples, without denoising."""
 
-    inputs: tuple[str, ...] = ("traced",)
-
     def __init__(self, spp: int = 1) -> None:
         """Render at `spp` samples per pixel."""
         super().__init__()
         self._spp = spp
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return ("traced",)
 
     @property
     def spp(self) -> int:
@@ -39,14 +41,24 @@ class OpenImageDenoise(PathTracing):
     The filter is told that both guides are free of noise. It sees exposed radiance.
     """
 
-    inputs = ("traced", "albedo", "normal")
+    def __init__(self, spp: int = 1, quality: Quality = "high", mirrors: bool = False) -> None:
+        """Denoise a rendering.
 
-    def __init__(self, spp: int = 1, quality: Quality = "high") -> None:
-        """Denoise a rendering at `spp` samples per pixel; `quality` is OIDN's mode, from fastest to slowest."""
+        Args:
+            spp: samples per pixel.
+            quality: OIDN's mode, from fastest to slowest.
+            mirrors: where a mirror or clear glass is seen, the albedo guide is the albedo of what it shows. A frame is
+                then charged for `Renderer.direct`, which also traces shadow rays that OIDN does not need.
+        """
         super().__init__(spp)
         if quality not in get_args(Quality):
             raise UserError(f"model.init_args.quality: must be one of {', '.join(get_args(Quality))}, is {quality!r}")
         self._quality = quality
+        self._mirrors = mirrors
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return ("traced", "albedo", "normal", *(("mirrored_albedo",) if self._mirrors else ()))
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         return {"denoise": self.denoise}
@@ -59,7 +71,8 @@ class OpenImageDenoise(PathTracing):
         import mitsuba_oidn as oidn
 
         exposure = batch["exposure"].view(-1, 1, 1, 1)
-        images = (batch["traced"] * exposure, batch["albedo"], batch["normal"])
+        albedo = batch["albedo"] + batch["mirrored_albedo"] if self._mirrors else batch["albedo"]
+        images = (batch["traced"] * exposure, albedo, batch["normal"])
         channels_last = [image.permute(0, 2, 3, 1).float().contiguous() for image in images]
         options = {"hdr": True, "clean_aux": True, "quality": oidn.Quality[self._quality.capitalize()]}
         denoised = [

@@ -64,6 +64,7 @@ UNTRAINED = (
     "oidn_4",
     "oidn_1_balanced",
     "oidn_1_fast",
+    "oidn_1_mirrors",
 )
 STEPS = 6  # 4 to an epoch
 # Methods that nothing in the package knows of.

@@ -469,21 +469,37 @@ def test_untrained(name):
     declared = {key: batch[key] for key in (*method.inputs, "exposure", "scene", "index")}
     expected = method(declared)
     assert expected.shape == (2, 3, 16, 16) and expected.isfinite().all() and expected.is_contiguous()
-    assert method.stages == (("gbuffer",) if "oidn" in name else ()) + ("path_tracing",)
+    rasters = (("gbuffer",) if "oidn" in name else ()) + (("direct_light",) if "mirrors" in name else ())
+    assert method.stages == (*rasters, "path_tracing")
     assert method.spp == int(re.findall(r"\d+", name)[0]) and method.pixel_fraction == 1
     assert not list(method.parameters())
     scaled = {**declared, "traced": batch["traced"] / 2, "exposure": batch["exposure"] * 2}
     torch.testing.assert_close(method(scaled), expected / 2, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["oidn_1", "oidn_1_balanced", "oidn_1_fast"])
+def test_oidn_sees_what_a_mirror_shows():
+    """A mirror has no albedo; its image of a checkerboard stays sharper with the checkerboard's albedo as a guide."""
+    generator = torch.Generator().manual_seed(0)
+    albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 4 + torch.arange(64) // 4) % 2)).expand(1, 3, 64, 64)
+    batch = {
+        "traced": albedo * torch.rand(1, 3, 64, 64, generator=generator) * 2, "albedo": torch.zeros(1, 3, 64, 64),
+        "mirrored_albedo": albedo, "exposure": torch.tensor([0.5]), "normal": torch.ones(1, 3, 64, 64) / 3**0.5,
+    }  # fmt: skip
+    plain, mirrors = [
+        (build_if_untrained(name)(batch) - albedo).square().mean() for name in ("oidn_1", "oidn_1_mirrors")
+    ]
+    assert mirrors < plain / 2
+
+
+@pytest.mark.parametrize("name", ["oidn_1", "oidn_1_balanced", "oidn_1_fast", "oidn_1_mirrors"])
 def test_oidn_removes_noise_and_keeps_edges_of_its_guides(name):
     """A checkerboard albedo under constant light, with noise: nearer to the truth than a twentieth of the noise."""
     generator = torch.Generator().manual_seed(0)
     albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2)).expand(1, 3, 64, 64)
     noise = torch.rand(1, 3, 64, 64, generator=generator) * 2
     batch = {
-        "traced": albedo * noise, "albedo": albedo, "exposure": torch.tensor([0.5]),
+        "traced": albedo * noise, "albedo": albedo, "mirrored_albedo": torch.zeros(1, 3, 64, 64),
+        "exposure": torch.tensor([0.5]),
         "normal": torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 64, 64),
     }  # fmt: skip
     error = (build_if_untrained(name)(batch) - albedo).square().mean()
