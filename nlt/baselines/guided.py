@@ -7,10 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.baselines.neural_field import NeuralField
+from nlt.display import expose
 from nlt.errors import UserError
+from nlt.models.correction import LEAST_ALBEDO, correction
 from nlt.models.module import Batch, join_channels, log_exposed
 
-_LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
 _DARKEST = 1e-6  # W·sr⁻¹·m⁻²; keeps the exposure of a black image finite
 
 
@@ -21,7 +22,7 @@ class GuidedOneSample(NeuralField):
     read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
     """
 
-    architecture = (*NeuralField.architecture, "relative", "gap", "rows_only")
+    architecture = (*NeuralField.architecture, "relative", "gap", "rows_only", "corrected")
 
     def __init__(
         self,
@@ -31,6 +32,7 @@ class GuidedOneSample(NeuralField):
         gap: int = 0,
         rows_only: bool = False,
         field_width: int = 0,
+        corrected: bool = False,
         **kwargs: Any,
     ) -> None:
         """The keyword arguments are those of the base class.
@@ -44,6 +46,8 @@ class GuidedOneSample(NeuralField):
                 stands for the k x k pixels around it.
             rows_only: leave out rows, not columns; a traced pixel stands for the k pixels around it in its column.
             field_width: channels of the field (nlt/baselines/neural_field.py); 0 for no field.
+            corrected: add what the image lacks in areas, by its noisy pixels (nlt/models/correction.py); in training,
+                too.
         """
         if gap < 0:
             raise UserError(f"model.init_args.gap: must be 0 or more, is {gap}")
@@ -73,6 +77,18 @@ class GuidedOneSample(NeuralField):
         reflected = F.interpolate(log_exposed(self._reflected(batch), self.exposure(batch)), batch["depth"].shape[2:])
         return join_channels([super().gbuffer(batch), reflected])
 
+    def to_radiance(self, batch: Batch, channels: Tensor) -> Tensor:
+        image = super().to_radiance(batch, channels)
+        if not self.hparams["corrected"]:
+            return image
+        albedo, exposure = self.albedo(batch), batch["exposure"]
+        reflected = expose(image - batch["emission"], exposure).mean(1, keepdim=True).clamp(min=0)
+        # Lamps are known, and the pixels at their edges show a part of them.
+        lamps = F.max_pool2d(batch["emission"].amax(1, keepdim=True), 3, 1, 1)
+        seen = (expose(batch["noisy"] - image, exposure), albedo, reflected, lamps == 0)
+        missing = F.interpolate(correction(*map(self._traced, seen)), image.shape[2:], mode="bilinear")
+        return image + expose((albedo + LEAST_ALBEDO) * missing, 1 / exposure)
+
     def exposure(self, batch: Batch) -> Tensor:
         """Return the scene's exposure (B,), or that which the noisy image itself asks for in each channel (B, 3)."""
         if not self.hparams["relative"]:
@@ -84,7 +100,7 @@ class GuidedOneSample(NeuralField):
     def _reflected(self, batch: Batch) -> Tensor:
         """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, rows, columns)."""
         noisy, emission, albedo = map(self._traced, (batch["noisy"], batch["emission"], self.albedo(batch)))
-        return (noisy - emission).clamp(min=0) / (albedo + _LEAST_ALBEDO)
+        return (noisy - emission).clamp(min=0) / (albedo + LEAST_ALBEDO)
 
     def _traced(self, image: Tensor) -> Tensor:
         """Return the traced pixels of an image (B, C, H, W), each in the middle of those that it stands for."""

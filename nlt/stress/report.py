@@ -28,6 +28,8 @@ DOUBLED = 2.0  # growth over the clean error at which a method breaks
 _CEILING = 1e3  # growth at which curves are clipped
 _ACROSS = 6  # panels of curves in a row
 _WORST = 8  # rows of the gallery
+_DENOISER = "oidn_1"  # what a method must not be worse than
+_WORSE = 1.1  # ratio of errors above which it is
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
 _NONE = "–"
 Row = dict[str, Any]
@@ -228,12 +230,32 @@ def _tables(stressed: Stressed) -> list[Table]:
     steady_columns = [f"{what}, {kind}" for kind in PATHS for what in ("change", "error")]
     all_tables = [
         Table("Breaking points", note, [label(method) for method in methods], points, first="ladder"),
+        _against_denoiser(stressed),
         Table("Ranks", "", rank_columns, ranks, first="ladder"),
         Table("Flicker", flicker_note, [*_FLICKERS.values(), *(f"path of the {kind}" for kind in PATHS)], flicker),
         Table("Steady frames", steady_note, steady_columns, steady),
         _trainings(stressed),
     ]
     return [table for table in all_tables if table.rows]
+
+
+def _against_denoiser(stressed: Stressed) -> Table:
+    """Return the largest ratio of each method's error to that of Open Image Denoise on 1 spp, by ladder."""
+    ratios = {
+        ladder: {method: own / errors[_DENOISER] for method, own in errors.items() if method != _DENOISER}
+        for ladder, errors in stressed.errors.items()
+        if _DENOISER in errors
+    }
+    methods = [method for method in stressed.methods if any(method in own for own in ratios.values())]
+    cell = lambda own: _NONE if own is None else _number(own.max(), ".2f")
+    rows = [[stressed.title(ladder), *(cell(own.get(m)) for m in methods)] for ladder, own in ratios.items()]
+    if rows:
+        changed = {m: np.concatenate([own[m][1:] for own in ratios.values() if m in own]) for m in methods}
+        rows.append(["median", *(_number(np.median(own), ".2f") for own in changed.values())])
+        above = lambda own: f"{(own > _WORSE).sum()} of {len(own)}"
+        rows.append([f"severities above {_WORSE}", *map(above, changed.values())])
+    note = f"Error over that of {label(_DENOISER)}: the largest of a ladder's severities, the clean views included."
+    return Table("Against Open Image Denoise", note, [label(method) for method in methods], rows, first="ladder")
 
 
 def _trainings(stressed: Stressed) -> Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -300,6 +301,31 @@ def test_sentences(made):
         "Left out: a thing.",
     ):
         assert sentence in text
+
+
+def test_against_open_image_denoise(made, tmp_path):
+    """The largest ratio of errors on a ladder, and how many severities are above 1.1."""
+    rows = read_rows(made / "stress" / "stress.csv")
+    like = [row for row in rows if (row["method"], row["suite"]) in (("cnn", "clean"), ("cnn", "light"))]
+    rows += [row | {"method": "oidn_1", "error": 0.3} for row in like]
+    write_rows(tmp_path / "stress" / "stress.csv", rows)
+    shutil.copy(made / "stress" / "manifest.json", tmp_path / "stress")
+    stress_section(tmp_path)
+    text = (tmp_path / "stress" / "stress.md").read_text()
+    table = text[text.index("## Against Open Image Denoise") : text.index("## Ranks")]
+    order = [cell.strip() for cell in table.splitlines()[4].split("|")[2:-1]]
+    assert sorted(order) == sorted(map(label, ("cnn", "nlt", "denoising_1_4")))
+    # Errors are 0.1 (1 + severity), 0.2 (1 + severity / 20) and 0.3, against 0.3.
+    expected = {
+        "cnn": ("2.00", "1.33", "3 of 5"),
+        "nlt": ("0.83", "0.77", "0 of 5"),
+        "denoising_1_4": ("1.00", "1.00", "0 of 5"),
+    }
+    for number, line in zip(range(3), table.splitlines()[6:], strict=False):
+        assert [cell.strip() for cell in line.split("|")[2:-1]] == [
+            expected[name][number] for name in sorted(expected, key=lambda name: order.index(label(name)))
+        ]
+    assert "points" not in table  # Open Image Denoise has no points
 
 
 def test_report(made):
