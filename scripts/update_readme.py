@@ -1,8 +1,8 @@
 """Update the documentation's copies of results and of the code's tables: `python scripts/update_readme.py`.
 
 Each block between `<!-- SOURCE -->` and `<!-- end -->` is generated again. SOURCE is a table of results
-(`results/NAME/table.md`, whose first table is shown), another page of results (shown whole, for example
-`results/NAME/stress/stress.md`), a group of fields (`nlt/data/sample.py FIELDS`), or a script with a function
+(`results/NAME/table.md`, whose first table is shown), another page of results (shown whole), the table below a heading of
+such a page (`results/NAME/stress/stress.md Ranks`), a group of fields (`nlt/data/sample.py FIELDS`), or a script with a function
 `tables()` (`scripts/paper_scale.py`).
 """
 
@@ -23,7 +23,7 @@ def content(source: str) -> str:
         return field_table(getattr(sample, name))
     if path.startswith("scripts/"):
         return str(runpy.run_path(str(PROJECT / path))["tables"]())
-    return first_table(PROJECT / path) if path.endswith("/table.md") else body(PROJECT / path)
+    return first_table(PROJECT / path, name) if name or path.endswith("/table.md") else body(PROJECT / path)
 
 
 def body(path: Path) -> str:
@@ -33,10 +33,11 @@ def body(path: Path) -> str:
     return re.sub(r"^#", "##", path.read_text().partition("\n")[2].strip(), flags=re.MULTILINE)
 
 
-def first_table(path: Path) -> str:
-    """Return the first table of a Markdown file."""
+def first_table(path: Path, heading: str = "") -> str:
+    """Return the first table of a Markdown file, or the first one below a heading."""
     lines = path.read_text().splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith("|"))
+    below = lines.index(f"## {heading}") if heading else 0
+    start = next(k for k in range(below, len(lines)) if lines[k].startswith("|"))
     stop = next(k for k in range(start, len(lines)) if not lines[k].startswith("|"))
     return "\n".join(lines[start:stop])
 
@@ -52,7 +53,7 @@ def field_table(fields: dict[str, sample.Field]) -> str:
 
 def update(text: str) -> str:
     """Return the text with every block generated again."""
-    block = re.compile(r"<!-- (results/\S+\.md|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
+    block = re.compile(r"<!-- (results/\S+\.md(?: [^>]+)?|nlt/\S+ \w+|scripts/\S+) -->\n.*?<!-- end -->", re.DOTALL)
     return block.sub(lambda m: f"<!-- {m[1]} -->\n{content(m[1])}\n<!-- end -->", text)
 
 
