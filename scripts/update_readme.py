@@ -1,9 +1,9 @@
 """Update the documentation's copies of results and of the code's tables: `python scripts/update_readme.py`.
 
 Each block between `<!-- SOURCE -->` and `<!-- end -->` is generated again. SOURCE is a table of results
-(`results/NAME/table.md`, whose first table is shown), another page of results (shown whole), the table below a heading of
-such a page (`results/NAME/stress/stress.md Ranks`), a group of fields (`nlt/data/sample.py FIELDS`), or a script with a function
-`tables()` (`scripts/paper_scale.py`).
+(`results/NAME/table.md`, whose first table is shown), the first table below a heading of another page of results
+(`results/NAME/stress/stress.md Ranks`), such a page as a whole (without a heading), a group of fields
+(`nlt/data/sample.py FIELDS`), or a script with a function `tables()` (`scripts/paper_scale.py`).
 """
 
 import re
