@@ -1,11 +1,11 @@
-"""Finds how small a model may be, and how much of the learned 3D network a scene needs.
+"""Finds how small a model may be.
 
     python benchmarks/leaner.py --seeds 3
-    python benchmarks/leaner.py --judge results/sizes results/photon_splat_bedroom
+    python benchmarks/leaner.py --judge results/sizes
 
-Runs `nlt compare` for five network sizes (results/sizes), and for photon splats in three settings and with three
-photon counts (results/photon_splat); a stopped run resumes. Then writes leanest.md to each directory from the stored
-results alone (`--judge` does only this): the cheapest method that is worse than the best by no more than seed noise.
+Runs `nlt compare` for five network sizes (results/sizes); a stopped run resumes. Then writes leanest.md there from the
+stored results alone (`--judge` does only this, for any results): the cheapest method that is worse than the best by no
+more than seed noise.
 """
 
 from __future__ import annotations
@@ -29,11 +29,6 @@ from nlt.metrics.quantities import METRICS
 from nlt.report.table_writer import grid
 
 STUDIES = {  # directory of the results: arguments of nlt compare
-    "results/photon_splat_living_room": "--config photon_splat",
-    "results/photon_splat_bedroom": "--config photon_splat --data builtin_bedroom_moving_lights",
-    "results/photon_splat_living_room_fixed_lights": "--config photon_splat --data demo_fixed_lights",
-    "results/photon_counts": "--config photon_splat --methods nlt_photons photon_splat "
-    "nlt_photons@photons_1000 photon_splat@photons_1000 nlt_photons@photons_100 photon_splat@photons_100",
     "results/sizes": "--config sizes",
 }
 KEYS = ("mse", "mssim")

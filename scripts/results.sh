@@ -39,15 +39,16 @@ if [ "$scale" = small ]; then
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --out results/direct_256 \
-        --methods cnn cnn@direct cnn@direct_other_rooms field field@direct guided_1spp guided_1spp@direct \
-        guided_1spp@direct_other_rooms guided_1spp@direct_fine_tuned_400 guided_1spp_1_4@direct guided_1spp_1_16@direct \
-        guided_1spp_field guided_1spp_field@direct \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
+        guided_1spp_1_4@direct guided_1spp_1_4@direct_corrected guided_1spp_1_4@direct_narrow \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_1_mirrors oidn_4 path_tracing_1 path_tracing_4
     once python scripts/teaser.py results/direct_256 --view 8 \
-        --methods path_tracing_1 cnn@direct guided_1spp@direct oidn_1_balanced oidn_1
-    once nlt compare --config demo --out results/demo_direct
-    room --config front --scale demo --methods cnn cnn@direct guided_1spp guided_1spp@direct oidn_1 oidn_4 \
-        --out results/mirrors
+        --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct guided_1spp@direct oidn_1_balanced oidn_1
+    once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
+        --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
+        --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1 oidn_4
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \

@@ -632,7 +632,7 @@ def test_crops_are_windows_of_the_images(dataset, crops):
     assert len(corners) > 6 and all(0 <= c <= 8 for corner in corners for c in corner)
 
 
-@pytest.mark.parametrize("method", ["nlt_photons", "photon_splat", "denoising_1_4"])
+@pytest.mark.parametrize("method", ["nlt_photons", "photons_only", "denoising_1_4"])
 def test_training_on_crops(crops, tmp_path, monkeypatch, method):
     """It trains on windows and is validated on whole images."""
     monkeypatch.chdir(tmp_path)

@@ -126,7 +126,6 @@ def test_stages_are_those_of_the_inputs(method):
         "feature_projection": ("gbuffer",),
         "nlt": ("gbuffer",),
         "nlt_photons": ("gbuffer", "photons"),
-        "photon_splat": ("gbuffer", "photons"),
         "field": ("gbuffer", "photons"),
         "guided_1spp": ("gbuffer", "path_tracing"),
         "guided_1spp_field": ("gbuffer", "photons", "path_tracing"),

@@ -8,9 +8,7 @@ import pytest
 import trimesh
 from conftest import LIGHT, plain_scene, write_room
 from scipy import ndimage, stats
-from torch.utils.data import default_collate
 
-from nlt.baselines.photon_splat import PhotonSplat
 from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
 from nlt.paths import scenes_root
@@ -76,39 +74,6 @@ def test_irradiance(tmp_path, case):
     assert compatible(np.array(shifted), direct) < 1e-6, "the test cannot tell a patch from its neighbour"
     if patch is WALL:  # with one bounce from the other walls
         assert compatible(np.array(ours), irradiancemeter(tmp_path, patch, 2)) < 1e-6, "nor direct from indirect"
-
-
-def test_photon_splat(tmp_path):
-    """The irradiance by photons explains Mitsuba's direct radiance in every pixel of a room."""
-    description = load_description(str(write_room(tmp_path)))
-    scene = Scene(description, "fixed_lights")
-    renderer, camera = Renderer(scene), sample_view(description, 48, np.random.default_rng(1))
-    buffer = renderer.gbuffer(camera)
-    view = {**buffer, "camera_matrix": camera.matrix, "world_to_view": camera.world_to_view,
-            "view_direction": camera.view_directions()}  # fmt: skip
-    batch = default_collate([{**view, **renderer.photons(4000, seed)} for seed in range(40)])
-    batch = {name: value.float() if value.is_floating_point() else value for name, value in batch.items()}
-    ours = PhotonSplat(width=1, footprint=0).irradiance(batch)
-    plain, albedo = mi.load_file(str(tmp_path / "scene.xml"), optimize=False), np.array([0.7, 0.6, 0.5])
-
-    def mitsubas(depth):
-        integrator = mi.load_dict({"type": "path", "max_depth": depth})
-        render = lambda k: mi.render(plain, sensor=sensor_of(camera), integrator=integrator, spp=16, seed=mi.UInt32(k))
-        images = np.stack([np.moveaxis(np.array(render(k)), 2, 0) for k in range(8)]).astype(float)
-        return images * np.pi / albedo[:, None, None]
-
-    # Pixels whose neighbours see the same surface, which is no lamp.
-    normal, emits = buffer["normal"], mitsubas(1).any((0, 1))
-    flat = ~ndimage.maximum_filter(emits, 3)
-    for channel in normal:
-        flat &= ndimage.maximum_filter(channel, 3) - ndimage.minimum_filter(channel, 3) < 1e-3
-    floor, walls = flat & (normal[1] > 0.9), flat & (np.abs(normal[1]) < 0.1)
-    assert floor.sum() > 100 and walls.sum() > 300
-    direct, bounced = mitsubas(2), mitsubas(3)
-    for pixels in (floor, walls):
-        region = lambda images, pixels=pixels: np.asarray(images)[..., pixels].mean(-1)
-        assert compatible(region(ours), region(direct)) > 1e-3
-        assert compatible(region(ours), region(bounced)) < 1e-6, "direct cannot be told from indirect"
 
 
 # ---- direct light ---------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.guided import GuidedOneSample
 from nlt.baselines.path_tracing import OpenImageDenoise
-from nlt.baselines.photon_splat import PhotonSplat
 from nlt.cli import main
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.render import SampleRenderer
@@ -58,11 +57,14 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
-    """Files of methods with random weights: `nlt` with embeddings of the living room's points, `splat` without."""
+    """Files of methods with random weights: `nlt` with embeddings of the living room's points, `photons` without."""
     folder = tmp_path_factory.mktemp("models")
     torch.manual_seed(0)
     size = {"width": 2, "depth": 1}
-    methods = {"nlt": NeuralLightTransport(use_photons=True, num_points=200, **size), "splat": PhotonSplat(**size)}
+    methods = {
+        "nlt": NeuralLightTransport(use_photons=True, num_points=200, **size),
+        "photons": NeuralLightTransport(use_photons=True, use_points=False, **size),
+    }
     files = {name: folder / f"{name}.safetensors" for name in methods}
     points = SampleRenderer(spec_of(), 0).points()
     for name, method in methods.items():
@@ -185,7 +187,7 @@ def test_without_embeddings_any_scene_will_do():
 def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
     """Frames that are there stay as they are; another command's are not mixed with them."""
     ask = lambda **more: render(
-        {"": str(models.splat)}, "bedroom", "frames", frames=4, resolution=(8, 8), spp=1, **more
+        {"": str(models.photons)}, "bedroom", "frames", frames=4, resolution=(8, 8), spp=1, **more
     )
     ask()
     folder = tmp_path / "frames"
@@ -199,20 +201,20 @@ def test_goes_on_where_it_was_killed(models, tmp_path, capsys):
     ask()
     assert {name: (folder / name).read_bytes() for name in first} == first | {"00001.png": red}
     (folder / ".00002.png.elsewhere.1.tmp").unlink()
-    arguments = ["render", models.splat, "bedroom", "-o", "frames", "--frames", "4", "--resolution", "8", "--spp", "1"]
-    assert main([*map(str, arguments), "--state", "1"]) == 2
+    arguments = f"render {models.photons} bedroom -o frames --frames 4 --resolution 8 --spp 1 --state 1"
+    assert main(arguments.split()) == 2
     assert "another command" in capsys.readouterr().err
     assert (folder / "00001.png").read_bytes() == red
 
 
 def test_layers_of_frames(models, tmp_path, refused):
     """The PNG shows the EXR's radiance; a frame whose EXR is missing is made again, and no other."""
-    ask = ["render", str(models.splat), "living_room", "--frames", "2", "--resolution", "24x16", "--spp", "2"]
+    ask = ["render", str(models.photons), "living_room", "--frames", "2", "--resolution", "24x16", "--spp", "2"]
     refused([*ask, "--exr", "-o", "video.mp4"], "--exr", "folder")
     assert main([*ask, "-o", "frames"]) == 0
     before = [pixels(tmp_path / f"frames/0000{k}.png") for k in range(2)]
     assert main([*ask, "-o", "frames", "--exr"]) == 0
-    model = ModelRenderer(*load_trained(str(models.splat))[:2], 0, CPU)
+    model = ModelRenderer(*load_trained(str(models.photons))[:2], 0, CPU)
     exposure = model.render.description.exposure
     for k, view in enumerate(cameras(model.render.description, "turntable", 2, 24, 16)):
         (moment,) = states(model.render.description, "moving_lights", "0", None, 1)
@@ -258,7 +260,7 @@ def test_embeddings_keep_their_points(models, monkeypatch):
 def test_without_noisy_input_nothing_is_traced(models, monkeypatch):
     traced = []
     monkeypatch.setattr(SampleRenderer, "radiance", lambda *arguments: traced.append(arguments))
-    model = ModelRenderer(*load_trained(str(models.splat))[:2], 0, CPU)
+    model = ModelRenderer(*load_trained(str(models.photons))[:2], 0, CPU)
     description = model.render.description
     (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
     with torch.no_grad():
@@ -267,7 +269,7 @@ def test_without_noisy_input_nothing_is_traced(models, monkeypatch):
 
 
 def test_direct_light_is_that_of_the_view(models):
-    model = ModelRenderer(CNN(width=2, direct_light=True), load_trained(str(models.splat))[1], 0, CPU)
+    model = ModelRenderer(CNN(width=2, direct_light=True), load_trained(str(models.photons))[1], 0, CPU)
     description = model.render.description
     (moment,), (view,) = states(description, "moving_lights", "3", None, 1), cameras(description, "turntable", 1, *SIZE)
     direct = model.batch(moment, view)["direct"][0].numpy()
@@ -431,23 +433,23 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     view = {"position": [0, 1, 0], "target": [1, 1, 0]}
     file = lambda name, content: str(write(tmp_path / name, content))
     tiny = ["--resolution", "8", "--frames", "1"]
-    plain = ["render", models.splat, "living_room", *tiny]
+    plain = ["render", models.photons, "living_room", *tiny]
     refused(["render", "nowhere.ckpt", "living_room"], "nowhere.ckpt", "cannot be read")
     refused(["render", "nowhere.safetensors", "living_room"], "nowhere.safetensors", "cannot be read")
     broken = tmp_path / "broken.safetensors"
-    broken.write_bytes(models.splat.read_bytes()[:-9])
+    broken.write_bytes(models.photons.read_bytes()[:-9])
     refused(["render", broken, "living_room"], broken, "damaged")
-    refused(["render", models.splat, "palace"], "palace", "known scenes")
+    refused(["render", models.photons, "palace"], "palace", "known scenes")
     refused(["render", models.nlt, "bedroom"], "bedroom", "embeddings", "living_room")
     method, *_ = load_trained(str(models.nlt))
     save_trained(method, spec_of(num_points=300), [], "more.safetensors")
     refused(["render", "more.safetensors", "living_room"], "200 points", "300")
     save_trained(method, spec_of(), [], "without.safetensors")
     refused(["render", "without.safetensors", "living_room"], "without.safetensors", "not the points", "train again")
-    refused(["render", models.splat], "CKPT and SCENE")
+    refused(["render", models.photons], "CKPT and SCENE")
     refused(["render", "palace"], "palace", "known scenes")
     refused(["render", models.nlt, "living_room", "--lights", "own"], "--lights", "embeddings", "moving_lights")
-    refused(["render", "--demo", models.splat, "living_room"], "CKPT and SCENE")
+    refused(["render", "--demo", models.photons, "living_room"], "CKPT and SCENE")
     refused([*plain, "-o", "video.avi"], "video.avi")
     refused([*plain, "--spp", "many"], "--spp")
     refused([*plain, "--camera-path", "nowhere.yaml"], "nowhere.yaml", "No such file")
@@ -471,6 +473,6 @@ def test_mistakes_are_one_line(models, tmp_path, refused):
     ):
         refused([*plain, "--state", file("state.yaml", state)], "state.yaml", *words)
     fixed = tmp_path / "fixed.safetensors"
-    save_trained(PhotonSplat(width=2, depth=1), spec_of(experiment="fixed_lights"), [], str(fixed))
+    save_trained(CNN(width=2, depth=1), spec_of(experiment="fixed_lights"), [], str(fixed))
     refused(["render", fixed, "living_room", "--light", "turntable"], "--light", "fixed_lights")
     assert not list(tmp_path.glob("video*"))
