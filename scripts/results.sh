@@ -42,6 +42,10 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_1_4@direct guided_1spp_1_4@direct_corrected guided_1spp_1_4@direct_narrow \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_1_mirrors oidn_4 path_tracing_1 path_tracing_4
+    room --config front --scale medium --out results/third \
+        --methods guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_thin oidn_1_balanced oidn_1 oidn_4
+    room --config front --scale demo --seeds 3 --out results/front_real \
+        --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1_balanced oidn_1 oidn_4
     once python scripts/teaser.py results/direct_256 --view 8 \
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct guided_1spp@direct oidn_1_balanced oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
