@@ -257,7 +257,8 @@ class RenderingModule(Method, L.LightningModule):
         """Return the optimiser's parameter groups: the network's, and those with options of their own."""
         return [{"params": list(self.parameters())}]
 
-    def configure_optimizers(self) -> Any:
+    def build_optimizer(self) -> torch.optim.Adam:
+        """Return the optimiser, without its schedule, which needs a trainer."""
         chosen = self.hparams
         groups, rate = self.parameter_groups(), chosen["learning_rate"]
         kind: type[torch.optim.Adam] = torch.optim.Adam
@@ -266,7 +267,10 @@ class RenderingModule(Method, L.LightningModule):
             is_matrix = lambda p: p.ndim > 1 and p is not self.unet.conv_out.weight
             matrices, rest = [[p for p in network["params"] if is_matrix(p) == wanted] for wanted in (True, False)]
             groups = [{"params": rest}, {"params": matrices, "orthogonal": True}, *others]
-        optimizer = kind(groups, lr=rate, decoupled_weight_decay=True, fused=True)
+        return kind(groups, lr=rate, decoupled_weight_decay=True, fused=True)
+
+    def configure_optimizers(self) -> Any:
+        chosen, optimizer = self.hparams, self.build_optimizer()
         if chosen["lr_schedule"] == "paper":
             return [optimizer], [ExponentialLR(optimizer, gamma=chosen["lr_decay"])]
         steps = int(self.trainer.estimated_stepping_batches)

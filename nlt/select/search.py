@@ -165,7 +165,7 @@ class Search:
         batch = default_collate([data[k % len(data)] for k in range(self._batch_size)])
         batch = {name: value.to(self.device) for name, value in batch.items()}
         module = module.to(self.device).train()
-        (optimizer,), _ = module.configure_optimizers()
+        optimizer = module.build_optimizer()
         seconds = []
         for _ in range(3):
             begin = now()

@@ -287,7 +287,8 @@ def space(tiny, tmp_path, monkeypatch, one_thread):
     monkeypatch.setattr(clock, "FRAMES", 3)
     monkeypatch.setattr(search, "Process", Here)
     monkeypatch.setenv(WAIT_POLICY, "passive")  # else it would be for the tests to come, too
-    scale = merge(SCALE, {"trainer": {"max_steps": STEPS, "max_epochs": -1}})
+    recipe = {"init_args": {"optimizer": "muon", "lr_schedule": "cosine"}}  # as the scales of configs/select
+    scale = merge(SCALE, {"model": recipe, "trainer": {"max_steps": STEPS, "max_epochs": -1}})
     sizes = [str(write(tmp_path / f"{name}.yaml", {"model": {"init_args": size}})) for name, size in SIZES.items()]
     content = {
         "data": str(tiny.data), "scale": str(write(tmp_path / "scale.yaml", scale)), "methods": ["cnn", "nlt_photons"],
