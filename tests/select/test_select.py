@@ -258,9 +258,17 @@ class FakeTime:
 
         def fit(this, run, candidate, seed, steps):
             self.begun.append((candidate.name, seed, steps, self.seconds))
-            if len(self.begun) == self.die:  # a kill after one more epoch
-                original(this, run, candidate, seed, steps - EPOCH)
-                raise Killed
+            if len(self.begun) == self.die:  # an epoch before the end
+                step = RenderingModule.training_step
+
+                def die(module, *batch):
+                    if module.global_step == steps - EPOCH:
+                        raise Killed
+                    return step(module, *batch)
+
+                with pytest.MonkeyPatch.context() as dying:
+                    dying.setattr(RenderingModule, "training_step", die)
+                    original(this, run, candidate, seed, steps)
             done = original(this, run, candidate, seed, steps)
             width = SIZES[candidate.size.rpartition("/")[2].removesuffix(".yaml")]["width"]
             self.seconds += self.setup + done * self.per_step * width
