@@ -55,7 +55,7 @@ class Stressed:
 
     @cached_property
     def methods(self) -> list[str]:
-        return sorted({row["method"] for row in self.rows}, key=order)
+        return sorted(dict.fromkeys(row["method"] for row in self.rows), key=order)
 
     def says(self, ladder: Ladder) -> str:
         """Return what a ladder changes."""
