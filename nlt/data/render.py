@@ -89,10 +89,8 @@ class SampleRenderer:
             "reference_b": (spec.reference_spp, half_b),
         }
         sample |= {name: self.radiance(camera, *image) for name, image in images.items() if name in fields}
-        if not fields.keys().isdisjoint(BUFFERS):
-            sample |= self.renderer.gbuffer(camera)
-        if not fields.keys().isdisjoint(DIRECT):
-            sample |= self.renderer.direct(camera)
+        if not fields.keys().isdisjoint((*BUFFERS, *DIRECT)):
+            sample |= self.renderer.gbuffer(camera, not fields.keys().isdisjoint(DIRECT))
         if any(name.startswith("photon_") for name in fields):
             sample |= self.renderer.photons(spec.num_photons, photons)
         return {

@@ -30,8 +30,8 @@ _WARM_UP_SHARE = 0.2  # of the time limit
 class Clock:
     """Measures the cost of methods on the same frames: a dataset's samples, each with its own state and view.
 
-    A frame's cost includes all that a renderer does for a new frame: G-buffer, direct light, photons, path tracing of
-    the method's input pixels, light transport, projection, and synthesis or denoising. Moving the scene's objects is
+    A frame's cost includes all that a renderer does for a new frame: G-buffer with direct light, photons, path tracing
+    of the method's input pixels, light transport, projection, and synthesis or denoising. Moving the scene's objects is
     left out, because it costs the same for all methods.
 
     `batch` is the number of frames computed at once; `policy` is None for the device's default.
@@ -83,9 +83,7 @@ class Clock:
         for row, index in enumerate(indices):
             renderer, camera = self.frames.place(index)
             if "gbuffer" in method.stages:
-                self._timed(seconds, "gbuffer", partial(renderer.gbuffer, camera))
-            if "direct_light" in method.stages:
-                self._timed(seconds, "direct_light", partial(renderer.direct, camera))
+                self._timed(seconds, "gbuffer", partial(renderer.gbuffer, camera, method.reads_direct_light))
             if "photons" in method.stages:
                 count = method.num_photons or spec.num_photons
                 self._timed(seconds, "photons", partial(renderer.photons, count, index))

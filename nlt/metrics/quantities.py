@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal
 
 # The stages of a frame, first rendered, then computed. A method's time includes only the stages that it needs.
-RENDERED_STAGES = ("gbuffer", "direct_light", "photons", "path_tracing")
+RENDERED_STAGES = ("gbuffer", "photons", "path_tracing")
 NETWORK_STAGES = ("transport", "projection", "synthesis")
 STATE_STAGES = ("photons", "transport")  # independent of the camera
 STAGES = (*RENDERED_STAGES, *NETWORK_STAGES, "denoise")

@@ -32,14 +32,18 @@ class Method(nn.Module):
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The renderer stages that a frame needs, out of "gbuffer", "direct_light", "photons" and "path_tracing"."""
+        """The renderer stages that a frame needs, out of "gbuffer", "photons" and "path_tracing"."""
         stages = {
-            "gbuffer": self._reads(*BUFFERS),
-            "direct_light": self._reads(*DIRECT),
+            "gbuffer": self._reads(*BUFFERS, *DIRECT),
             "photons": any(name.startswith("photon_") for name in self.inputs),
             "path_tracing": self.pixel_fraction > 0,
         }
         return tuple(name for name, needed in stages.items() if needed)
+
+    @property
+    def reads_direct_light(self) -> bool:
+        """Whether the stage "gbuffer" also traces shadow rays."""
+        return self._reads(*DIRECT)
 
     @property
     def pixel_fraction(self) -> float:

@@ -54,7 +54,8 @@ class Renderer:
         self.emitters = list(scene.mi_scene.emitters())
         self._lamps = [shape for shape in scene.mi_scene.shapes() if shape.is_emitter()]
         self._radiance = freeze(_radiance if is_path else _bidirectional)
-        self._gbuffer, self._direct, self._transmits = freeze(_gbuffer), freeze(_direct), freeze(_transmits)
+        # The second also traces shadow rays, which Dr.Jit cannot freeze for every lamp.
+        self._gbuffer, self._transmits = (freeze(_gbuffer), freeze(_gbuffer)), freeze(_transmits)
         self._photons = [freeze(_photons) for _ in self.emitters]
         self._pilots: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # by scene.lit
         room = scene.description.room
@@ -132,44 +133,36 @@ class Renderer:
             dr.make_opaque(values)
         return {"scene": self.scene.mi_scene, **values}
 
-    def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
-        """Trace primary rays, which pass through the transparent parts of opacity masks.
+    def gbuffer(self, camera: Camera, direct: bool = False) -> dict[str, np.ndarray]:
+        """Trace primary rays, and shadow rays if `direct`. They pass through the transparent parts of opacity masks.
+
+        Shadow rays start at the surface at the pixel's centre, or at the one that a mirror or pane shows there. They go
+        to four fixed points of each lamp; to 16 if there is an environment, which gets as many, or a lamp of more than
+        two triangles, of which some face away. So there is no noise, and a penumbra has a few shades.
 
         Returns:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
-            radiance seen directly from lamps and from the environment, as means over each pixel's area.
+            radiance seen directly from lamps and from the environment, as means over each pixel's area. If `direct`,
+            also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps; and
+            mirrored_albedo (3, H, W), the albedo there times what mirrors and glass on the way let pass, or 0 where
+            there are none. A lamp in a mirror is a white surface that reflects what it emits.
         """
         corners = np.floor(camera.centres()).astype(np.float32)
         lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
         fixed = {"masks": self.scene.masks, "sky": self.scene.environment is not None, **self._camera_values(camera)}
         fixed["size"] = mi.Vector2f(camera.width, camera.height)
         dr.make_opaque(fixed["size"])
-        point, normal, albedo, emission, valid = launch(self._gbuffer, lanes, **fixed)
+        is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
+        fixed["shadow_rays"] = direct * len(self.emitters) * (_SHADOW_RAYS_FLAT if is_flat else _SHADOW_RAYS)
+        point, normal, albedo, emission, valid, *light = launch(self._gbuffer[direct], lanes, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
         buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(valid[:, None], normal, 0)}
         buffers |= {"albedo": albedo, "emission": emission}
+        if direct:
+            buffers["direct"], buffers["mirrored_albedo"] = light
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
-
-    def direct(self, camera: Camera) -> dict[str, np.ndarray]:
-        """Trace shadow rays from the surface at each pixel's centre, or from the one that a mirror or pane shows there.
-
-        Shadow rays go to four fixed points of each lamp; to 16 if there is an environment, which gets as many, or a
-        lamp of more than two triangles, of which some face away. So there is no noise, and a penumbra has a few shades.
-        Like primary rays, shadow rays pass through opacity masks.
-
-        Returns:
-            direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps; and
-            mirrored_albedo (3, H, W), the albedo there times what mirrors and glass on the way let pass, or 0 where
-            there are none. A lamp in a mirror is a white surface that reflects what it emits.
-        """
-        lanes = {"corner": ("Point2f", np.floor(camera.centres()).astype(np.float32))}
-        fixed = {"masks": self.scene.masks, **self._camera_values(camera)}
-        is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
-        fixed["rays"] = len(self.emitters) * (_SHADOW_RAYS_FLAT if is_flat else _SHADOW_RAYS)
-        images = [image.T.reshape(3, camera.height, camera.width) for image in launch(self._direct, lanes, **fixed)]
-        return dict(zip(("direct", "mirrored_albedo"), images, strict=True))
 
     def _may_see_lamp(self, camera: Camera) -> np.ndarray:
         """Return (H W,) bool: the pixels that cover part of a lamp's bounding box. No others have a lamp's emission."""
@@ -290,8 +283,10 @@ def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image
     return (value, *(part for splat in splats for part in splat))
 
 
-def _gbuffer(scene: Any, masks: bool, sky: bool, corner: Any, lit: Any, size: Any, **camera: Any) -> tuple:
-    """Return point, normal, albedo, emission and whether the ray hit. `lit` is 0 in pixels that see no lamp.
+def _gbuffer(
+    scene: Any, masks: bool, sky: bool, shadow_rays: int, corner: Any, lit: Any, size: Any, **camera: Any
+) -> tuple:
+    """Return point, normal, albedo, emission, whether the ray hit, and direct light. `lit` is 0 where no lamp is seen.
 
     It is one kernel because, however few rays a kernel traces, Dr.Jit needs 2 to 4 ms to look at the whole scene.
     """
@@ -306,7 +301,8 @@ def _gbuffer(scene: Any, masks: bool, sky: bool, corner: Any, lit: Any, size: An
     lit = (lit > 0) | (escapes & sky)
 
     emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_SIDE, lit)
-    return centre.p, centre.sh_frame.n, albedo, emission, valid
+    light = _direct(scene, masks, shadow_rays, centre) if shadow_rays else ()
+    return centre.p, centre.sh_frame.n, albedo, emission, valid, *light
 
 
 def _emission(scene: Any, interaction: Any) -> Any:
@@ -351,8 +347,8 @@ def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any
     return total / side**2
 
 
-def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> tuple:
-    surface, tint, bounces = _through_mirrors(scene, _ray(corner + 0.5, **camera), masks)
+def _direct(scene: Any, masks: bool, rays: int, surface: Any) -> tuple:
+    surface, tint, bounces = _through_mirrors(scene, surface, masks)
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
 
     def step(k: Any, total: Any) -> tuple:
@@ -373,8 +369,8 @@ def _direct(scene: Any, masks: bool, rays: int, corner: Any, **camera: Any) -> t
     return dr.select(is_lamp, emission, total / (rays * dr.pi)), albedo
 
 
-def _through_mirrors(scene: Any, ray: Any, masks: bool) -> tuple[Any, Any, Any]:
-    """Follow a ray to the first surface that is no mirror or clear glass; it passes glass where it can.
+def _through_mirrors(scene: Any, surface: Any, masks: bool) -> tuple[Any, Any, Any]:
+    """Follow the ray that hit `surface` on to the first that is no mirror or clear glass, through glass where possible.
 
     Returns the interaction there, the share of its radiance that reaches the camera, and the number of mirrors and
     panes on the way.
@@ -393,7 +389,7 @@ def _through_mirrors(scene: Any, ray: Any, masks: bool) -> tuple[Any, Any, Any]:
         onward = surface.spawn_ray(surface.to_world(sample.wo))
         return first_surface(scene, onward, masks), tint * mi.Color3f(weight), bounces + 1
 
-    return dr.while_loop((first_surface(scene, ray, masks), mi.Color3f(1), mi.UInt32(0)), is_clear, step)
+    return dr.while_loop((surface, mi.Color3f(1), mi.UInt32(0)), is_clear, step)
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:

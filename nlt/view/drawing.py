@@ -89,10 +89,8 @@ class ModelRenderer:
                 self._state = self.render.view(camera, self._seeds, self._state_fields)
             self._key = state.key
         with self.stage("gbuffer"):
-            view = self.render.view(camera, self._seeds, {*(names & {*BUFFERS}), "camera_matrix", "world_to_view"})
-        if direct := names & {*DIRECT}:
-            with self.stage("direct_light"):
-                view |= self.render.view(camera, self._seeds, direct)
+            shown = names & {*BUFFERS, *DIRECT}
+            view = self.render.view(camera, self._seeds, {*shown, "camera_matrix", "world_to_view"})
         if traced:
             with self.stage("path_tracing"):
                 view |= self.render.view(camera, seeds, traced)

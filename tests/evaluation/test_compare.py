@@ -56,7 +56,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 CPU = torch.device("cpu")
 ACCURACY = ("mse", "unbiased_mse", "reference_noise", "mssim", "fid", "feature_l1")
-STAGES = ("gbuffer", "direct_light", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
+STAGES = ("gbuffer", "photons", "path_tracing", "transport", "projection", "synthesis", "denoise")
 UNTRAINED = (
     "path_tracing_1",
     "path_tracing_4",
@@ -103,7 +103,7 @@ class KilledOnce(NeuralLightTransport):
         return super().training_step(batch, batch_idx)
 
 class Extra(CNN):
-    stages = ("photons", "direct_light", "gbuffer")
+    stages = ("photons", "gbuffer")
 """
 
 

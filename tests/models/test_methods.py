@@ -143,11 +143,11 @@ DIRECT = [path for path in CONFIGS if not path.stem.startswith(("denoising", "ab
 
 @pytest.mark.parametrize("config", DIRECT, ids=lambda path: path.stem)
 def test_direct_light(config):
-    """A switch of every method that reads the G-buffer: six more channels, one more stage."""
+    """A switch of every method that reads the G-buffer: six more channels, no more stages."""
     batch, without = synthetic_batch(), build(config)
     method = build(config, find_config("variant", "direct")).eval()
     assert {*method.inputs} - {*without.inputs} == {"direct", "mirrored_albedo"}
-    assert [stage for stage in method.stages if stage != "direct_light"] == [*without.stages]
+    assert method.stages == without.stages and method.reads_direct_light > without.reads_direct_light
     assert method.feature_channels == without.feature_channels + 6
     with torch.no_grad():
         features = method.features(batch, method.transport(batch))
@@ -468,8 +468,8 @@ def test_untrained(name):
     declared = {key: batch[key] for key in (*method.inputs, "exposure", "scene", "index")}
     expected = method(declared)
     assert expected.shape == (2, 3, 16, 16) and expected.isfinite().all() and expected.is_contiguous()
-    rasters = (("gbuffer",) if "oidn" in name else ()) + (("direct_light",) if "mirrors" in name else ())
-    assert method.stages == (*rasters, "path_tracing")
+    assert method.stages == (*(("gbuffer",) if "oidn" in name else ()), "path_tracing")
+    assert method.reads_direct_light == ("mirrors" in name)
     assert method.spp == int(re.findall(r"\d+", name)[0]) and method.pixel_fraction == 1
     assert not list(method.parameters())
     scaled = {**declared, "traced": batch["traced"] / 2, "exposure": batch["exposure"] * 2}

@@ -92,8 +92,9 @@ def test_direct_light(tmp_path):
     description = load_description(str(write_room(tmp_path)))
     renderer = Renderer(Scene(description, "fixed_lights"))
     camera = Camera.look_at(np.array([-0.9, 1.2, -0.6]), np.array([-0.6, 0, 0.2]), np.array([0, 1.0, 0]), 60, 32, 32)
-    buffer, direct = renderer.gbuffer(camera), renderer.direct(camera)["direct"]
-    assert np.array_equal(renderer.direct(camera)["direct"], direct), "it has no noise"
+    buffer = renderer.gbuffer(camera, direct=True)
+    direct = buffer["direct"]
+    assert np.array_equal(renderer.gbuffer(camera, direct=True)["direct"], direct), "it has no noise"
     rows = lambda image: image.reshape(3, -1).T.astype(float)
     ours, directions, normal = rows(direct), rows(camera.view_directions()), rows(buffer["normal"])
     place = camera.position + directions * (buffer["depth"].reshape(-1, 1) / (directions @ camera.rotation[:, 2:]))
@@ -125,7 +126,7 @@ def test_direct_light_of_the_sky(tmp_path):
         sky = f'<emitter type="constant"><rgb name="radiance" value="{radiance}"/></emitter></scene>'
         source.write_text(source.read_text().replace("</scene>", sky))
         camera = Camera.look_at(np.array([0.6, 1.0, -0.6]), np.array([0.6, 0, -0.5]), np.array([0, 1.0, 0]), 20, 8, 8)
-        direct = Renderer(Scene(description, "fixed_lights")).direct(camera)["direct"]
+        direct = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)["direct"]
         expected = np.broadcast_to(np.float32(radiance.split(", "))[:, None, None], direct.shape)
         np.testing.assert_allclose(direct, expected, rtol=0.3)
 
@@ -137,11 +138,12 @@ def test_direct_light_of_a_bulb(tmp_path):
     bulb.apply_translation([0, 1.5, 0]).export(tmp_path / "lamp.ply")
     camera = Camera.look_at(np.array([0.6, 1.0, -0.5]), np.array([0.5, 0, -0.6]), np.array([0, 1.0, 0]), 30, 8, 8)
     renderer = Renderer(Scene(description, "fixed_lights"))
-    depth, directions = renderer.gbuffer(camera)["depth"].reshape(-1, 1), camera.view_directions().reshape(3, -1).T
+    buffer = renderer.gbuffer(camera, direct=True)
+    depth, directions = buffer["depth"].reshape(-1, 1), camera.view_directions().reshape(3, -1).T
     place = camera.position + directions * (depth / (directions @ camera.rotation[:, 2:]))
     distance = np.linalg.norm(place - [0, 1.5, 0], axis=1)
     expected = np.outer(LIGHT["radiance"], 0.1**2 * 1.5 / distance**3)
-    np.testing.assert_allclose(renderer.direct(camera)["direct"].reshape(3, -1), expected, rtol=0.4)
+    np.testing.assert_allclose(buffer["direct"].reshape(3, -1), expected, rtol=0.4)
 
 
 PANE = """<shape type="rectangle"><transform name="to_world">
@@ -163,11 +165,11 @@ def test_direct_light_by_way_of(tmp_path, case):
     there, columns = camera, slice(None)
     if case == "mirror":
         there, columns = Camera.look_at(np.array([2.9, 0.6, -0.7]), target, up, *view), slice(None, None, -1)
-    ours, theirs, buffer = behind.direct(camera), free.direct(there), free.gbuffer(there)
+    ours, theirs = behind.gbuffer(camera, direct=True), free.gbuffer(there, direct=True)
     tint = np.array([[0.5], [0.4], [0.3]]) if case == "mirror" else np.ones((3, 1))
-    pane = (behind.gbuffer(camera)["albedo"] == 0).all(0)  # elsewhere the crate stands before it
-    lamp = pane & (buffer["emission"] == np.array(LIGHT["radiance"])[:, None, None]).all(0)[:, columns]
-    diffuse = pane & ((buffer["depth"][0] > 0) & (buffer["emission"] == 0).all(0))[:, columns]
+    pane = (ours["albedo"] == 0).all(0)  # elsewhere the crate stands before it
+    lamp = pane & (theirs["emission"] == np.array(LIGHT["radiance"])[:, None, None]).all(0)[:, columns]
+    diffuse = pane & ((theirs["depth"][0] > 0) & (theirs["emission"] == 0).all(0))[:, columns]
     assert lamp.sum() > 3 and diffuse.sum() > 100 and not theirs["mirrored_albedo"].any()
     image = theirs["direct"][:, :, columns]
     agrees = np.isclose(ours["direct"], image, rtol=1e-2, atol=1e-4).all(0)

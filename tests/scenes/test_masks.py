@@ -84,7 +84,7 @@ def test_direct_light(tmp_path, masked):
         x, y, z = camera.view_directions()
         height, aside = 1 + y / np.abs(x), z / np.abs(x)
         wall = (np.abs(aside) < 0.99) & (height > 0.5) & (height < HEIGHT)  # whose rays to the lamp stay on its side
-        ours, unhindered = (renderer.direct(camera)["direct"][:, wall] for renderer in (masked, free))
+        ours, unhindered = (renderer.gbuffer(camera, direct=True)["direct"][:, wall] for renderer in (masked, free))
         assert wall.sum() > 100 and unhindered.all()
         np.testing.assert_allclose(ours, unhindered if side < 0 else 0, rtol=1e-4)
 
