@@ -41,16 +41,20 @@ if [ "$scale" = small ]; then
     room --config front --scale medium --out results/direct_256 \
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_1_4@direct guided_1spp_1_4@direct_corrected guided_1spp_1_4@direct_narrow \
+        guided_1spp_1_4@direct_thin guided_1_1@direct \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_1_mirrors oidn_4 path_tracing_1 path_tracing_4
-    room --config front --scale medium --out results/third \
-        --methods guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_thin oidn_1_balanced oidn_1 oidn_4
     room --config front --scale demo --seeds 3 --out results/front_real \
-        --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1_balanced oidn_1 oidn_4
+        --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected guided_1_1@direct \
+        guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
+        oidn_1_balanced oidn_1 oidn_4
+    once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
+        --suites light geometry materials camera frame --methods cnn@direct guided_1spp guided_1spp@direct \
+        guided_1spp@direct_corrected guided_1spp@direct_corrected_other_rooms oidn_1 oidn_4
     once python scripts/teaser.py results/direct_256 --view 8 \
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct guided_1spp@direct oidn_1_balanced oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        guided_1_1@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1 oidn_4
     room --config other_rooms --scale medium --out results/other_rooms
@@ -71,7 +75,7 @@ if [ "$scale" = small ]; then
     for method in feature_projection nlt photons_only guided_1_1; do
         parts="$parts $method $method@radiance $method@paper_schedule $method@adam"
     done
-    once nlt compare --config recipe --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
+    once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/narrow \
         --methods cnn cnn@narrow nlt_photons nlt_photons@narrow guided_1_1 guided_1_1@narrow oidn_1 oidn_4
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
