@@ -85,7 +85,7 @@ if [ "$scale" = small ]; then
     room --config front --scale any_room --out results/any_room \
         --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
     once python benchmarks/leaner.py --seeds 2
-    once python benchmarks/selection.py --minutes 20
+    once python benchmarks/selection.py
     once nlt compare --config diagnosis
     once nlt compare --config diagnosis --scale short_resolution_128 \
         --methods path_tracing_1 denoising_1_1 denoising_1_16 denoising_1_32 denoising_1_64 \
