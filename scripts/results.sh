@@ -75,7 +75,12 @@ if [ "$scale" = small ]; then
     for method in feature_projection nlt photons_only guided_1_1; do
         parts="$parts $method $method@radiance $method@paper_schedule $method@adam"
     done
-    once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
+    once nlt compare --config recipe --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
+    for method in feature_projection nlt photons_only guided_1_1; do
+        parts="$parts $method@clipped $method@no_emission"
+    done
+    once nlt compare --config recipe --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/recipe_demo \
+        --methods $parts feature_projection@slow_embedding nlt@slow_embedding
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/narrow \
         --methods cnn cnn@narrow nlt_photons nlt_photons@narrow guided_1_1 guided_1_1@narrow oidn_1 oidn_4
     once nlt compare --config recipe --scale recipe_6400 --workers "${WORKERS:-2}" \
