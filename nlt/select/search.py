@@ -39,7 +39,6 @@ from nlt.select.space import Candidate, SearchSpace
 
 SCORES = ("unbiased_mse", "mssim")  # where they disagree, the first one decides
 _ETA, _ROUNDS = 3, 3  # one in three candidates continues; the largest number of planned rounds
-_LEAST = 3  # least number of candidates in the last round
 _ENOUGH = 10  # candidates; if fewer fit into the budget, the rounds get fewer steps
 _TIMING = 0.1  # share of the budget, at most, for timing steps, and as much again for timing frames
 _SETUP = 3.0  # seconds that a training takes in addition to its steps, about
@@ -64,8 +63,8 @@ class Entry:
 class Search:
     """Trains a space's candidates, the worse ones for a short time only.
 
-    The full model and the best candidate of each method in `advised` continue to the last round. A method that has to
-    learn what others are given, for example where light arrives in a static scene, is worse than them at first.
+    The full model, the best candidate and the best one of each method in `advised` continue to the last round. A method
+    that has to learn what others are given, for example where light arrives in a static scene, is worse at first.
     """
 
     def __init__(self, space: SearchSpace, dataset: Any, root: Path, advised: Sequence[str] = ()) -> None:
@@ -180,7 +179,7 @@ class Search:
 
     def _counts(self, rounds: list[int], first: int) -> list[int]:
         """Return the number of candidates in each round, with `first` in the first one."""
-        return [max(math.ceil(first / _ETA**k), min(_LEAST, first)) for k in range(len(rounds))]
+        return [max(math.ceil(first / _ETA**k), min(2 + len(self.advised), first)) for k in range(len(rounds))]
 
     def _estimate(self, candidate: Candidate, steps: int) -> float:
         """Return a training's estimated seconds, corrected by the latest trainings."""
@@ -240,11 +239,12 @@ class Search:
         return finals
 
     def _order(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Return candidates by priority: the full model, the best of each advised method, the others."""
+        """Return candidates by priority: the full model, the best, the best of each advised method, the others."""
         times = {c: float(self.entries[c].cost["time_per_frame_s"]) for c in candidates}
         order = ranked([self.errors(candidates, key) for key in SCORES], times)
         advised = {c.method: c for c in reversed(order) if c.method in self.advised}.values()
-        return sorted(order, key=lambda c: 0 if c == self.space.full else 1 if c in advised else 2)
+        kept = [self.space.full, order[0], *advised]
+        return sorted(order, key=lambda c: kept.index(c) if c in kept else len(kept))
 
     # --- a training ---
 

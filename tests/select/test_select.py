@@ -36,7 +36,7 @@ from nlt.scenes.description import EXPERIMENTS, load_description
 from nlt.scenes.pointcloud import sample_points
 from nlt.select import advice, search
 from nlt.select.choice import choose, paired_difference, ranked, within
-from nlt.select.space import SearchSpace
+from nlt.select.space import Candidate, SearchSpace
 from nlt.waiting import WAIT_POLICY
 
 pytestmark = pytest.mark.slow
@@ -322,10 +322,10 @@ def test_end_to_end(space, tiny, monkeypatch, capsys):
         "nlt_photons@b, 64 points, 64 photons"
     }
     said = capsys.readouterr().out
-    assert "6 of 6 candidates fit" in said and "6 for 4 steps, 3 for 12 steps" in said and "nothing moves" in said
+    assert "6 of 6 candidates fit" in said and "6 for 4 steps, 4 for 12 steps" in said and "nothing moves" in said
     # Rungs: every training goes on where it was, the finalists with a second seed.
     steps = [int(row["steps"]) for row in rows]
-    assert sorted(steps) == [EPOCH] * 3 + [STEPS] * 3 and len(fake.begun) == 6 + 3 + 3
+    assert sorted(steps) == [EPOCH] * 2 + [STEPS] * 4 and len(fake.begun) == 6 + 4 + 4
     (chosen,) = (row for row in rows if row["chosen"] == "1")
     finals = [row for row in rows if row["steps"] == str(STEPS)]
     assert chosen in finals and all(row["seeds"] == "2" for row in finals)
@@ -395,8 +395,20 @@ def test_advised_methods_go_to_the_end(space, monkeypatch, lights):
     monkeypatch.setattr(search.Search, "score", worse)
     monkeypatch.setattr(clock.Clock, "time_interleaved", slower)
     finals = [row for row in run_select(space) if row["steps"] == str(STEPS)]
-    assert len(finals) == 3 and any(row["full"] == "1" for row in finals)
+    assert len(finals) == 4 and any(row["full"] == "1" for row in finals)
     assert sum(row["method"] == "cnn" for row in finals) == (0 if lights else 1)
+
+
+def test_the_best_goes_on_although_no_advice_names_it():
+    methods = {"full": 3.0, "advised": 2.0, "also_advised": 4.0, "best": 1.0, "other": 1.5}
+    candidates = {method: Candidate(method, "medium", None, None) for method in methods}
+    entries = {c: SimpleNamespace(cost={"time_per_frame_s": 1.0}) for c in candidates.values()}
+    errors = lambda chosen, key: {c: np.full((1, 4), methods[c.method]) for c in chosen}
+    made = SimpleNamespace(
+        space=SimpleNamespace(full=candidates["full"]), advised=["advised", "also_advised"], entries=entries, errors=errors
+    )
+    order = [candidate.method for candidate in search.Search._order(made, list(entries))]
+    assert order == ["full", "best", "advised", "also_advised", "other"]
 
 
 def test_variants(space, tmp_path):
