@@ -242,8 +242,8 @@ class Search:
         """Return candidates by priority: the full model, the best, the best of each advised method, the others."""
         times = {c: float(self.entries[c].cost["time_per_frame_s"]) for c in candidates}
         order = ranked([self.errors(candidates, key) for key in SCORES], times)
-        advised = {c.method: c for c in reversed(order) if c.method in self.advised}.values()
-        kept = [self.space.full, order[0], *advised]
+        best = {c.method: c for c in reversed(order)}
+        kept = [self.space.full, order[0], *(c for c in order if c == best[c.method] and c.method in self.advised)]
         return sorted(order, key=lambda c: kept.index(c) if c in kept else len(kept))
 
     # --- a training ---

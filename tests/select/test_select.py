@@ -404,9 +404,8 @@ def test_the_best_goes_on_although_no_advice_names_it():
     candidates = {method: Candidate(method, "medium", None, None) for method in methods}
     entries = {c: SimpleNamespace(cost={"time_per_frame_s": 1.0}) for c in candidates.values()}
     errors = lambda chosen, key: {c: np.full((1, 4), methods[c.method]) for c in chosen}
-    made = SimpleNamespace(
-        space=SimpleNamespace(full=candidates["full"]), advised=["advised", "also_advised"], entries=entries, errors=errors
-    )
+    space, advised = SimpleNamespace(full=candidates["full"]), ["advised", "also_advised"]
+    made = SimpleNamespace(space=space, advised=advised, entries=entries, errors=errors)
     order = [candidate.method for candidate in search.Search._order(made, list(entries))]
     assert order == ["full", "best", "advised", "also_advised", "other"]
 
