@@ -19,8 +19,8 @@ from nlt.report import plots
 from nlt.report.table_writer import Table, grid, section
 
 BENCH = "bench.json"
-_COLOUR = dict(zip(STAGES, (*plots.COLOURS, "#999999"), strict=True))
-_HATCH = dict(zip(STAGES, ("", "++", "//", "..", "xx", "\\\\", "", "--"), strict=True))
+_COLOUR = dict(zip(STAGES, plots.COLOURS, strict=True))
+_HATCH = dict(zip(STAGES, ("", "//", "..", "xx", "\\\\", "", "--"), strict=True))
 _MARKER = dict(zip(STAGES, plots.MARKERS, strict=False))
 Row = dict[str, Any]
 
