@@ -15,6 +15,7 @@ from conftest import LIGHT, demo_meshes, first_hit, plain_scene, write_room, wri
 from scipy import ndimage, stats
 
 from nlt.baselines.cnn import CNN
+from nlt.data.sample import DIRECT
 from nlt.errors import UserError
 from nlt.rendering import renderer as renderer_module
 from nlt.rendering import variant as variant_module
@@ -236,7 +237,8 @@ def test_window_of_an_image(renderer, demo):
     for name, values in part.items():
         border = int(name == "albedo")  # a window does not know whether the albedo differs beyond its border
         seen = np.s_[:, border : 8 - border, border : 8 - border]
-        np.testing.assert_allclose(values[seen], whole[name][inside][seen], rtol=1e-3, atol=1e-3, err_msg=name)
+        bound = 1e-3 if name in DIRECT else 1e-4  # shadow rays may just miss or hit
+        np.testing.assert_allclose(values[seen], whole[name][inside][seen], rtol=bound, atol=bound, err_msg=name)
     np.testing.assert_allclose(window.view_directions(), camera.view_directions()[inside], atol=1e-6)
 
 
