@@ -62,13 +62,11 @@ if [ "$scale" = small ]; then
     room --config table2_real --out results/real_living_room_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
 fi
-for comparison in table2_real table1_real ablation table2_builtin table1_builtin; do
-    publish --config "$comparison" --seeds 3
-done
-for comparison in ablation_real static_kitchen_real static_bathroom_real static_kitchen_builtin static_bathroom_builtin; do
-    publish --config "$comparison"
-done
-once nlt stress --config table2_real --scale "$scale" --views 1
+if [ "$scale" != small ]; then
+    for comparison in table2_real table1_real ablation_real static_kitchen_real static_bathroom_real; do
+        publish --config "$comparison"
+    done
+fi
 if [ "$scale" = small ]; then
     once nlt compare --config recipe --seeds 3 --workers "${WORKERS:-2}" --out results/recipe
     parts=
@@ -89,13 +87,7 @@ if [ "$scale" = small ]; then
         --methods $table2 cnn@before nlt_photons@before guided_1spp guided_1spp_field photons_only field photon_field
     room --config front --scale any_room --out results/any_room \
         --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
-    once python benchmarks/leaner.py --seeds 2
     once python benchmarks/selection.py
-    once nlt compare --config diagnosis
-    once nlt compare --config diagnosis --scale short_resolution_128 \
-        --methods path_tracing_1 denoising_1_1 denoising_1_16 denoising_1_32 denoising_1_64 \
-        cnn feature_projection nlt nlt_photons
-    once nlt compare --config diagnosis --scale short_images_3200 --methods cnn feature_projection nlt nlt_photons
 fi
 for report in results/*/report.html; do  # small enough for git
     case $report in results/table*) megabytes=8 ;; *) megabytes=4 ;; esac

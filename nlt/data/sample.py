@@ -62,14 +62,14 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "radiance that a white diffuse surface at the pixel centre, or seen in a mirror or through clear glass there, "
-        "would reflect of direct light; noise-free",
+        "radiance that a white diffuse surface there, or seen in a mirror or through clear glass, would reflect of "
+        "direct light; the pixel's mean weighted by albedo, noise-free",
     ),
     "mirrored_albedo": Field(
         (3, "H", "W"),
         "float16",
         "1",
-        "albedo of the surface seen in a mirror or through clear glass, times what these let pass; elsewhere 0",
+        "pixel mean of the albedo seen in a mirror or through clear glass, times what these let pass; elsewhere 0",
     ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, maps view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, maps world space to view space; a rigid transform"),

@@ -28,8 +28,10 @@ _PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
 _MOST_CASTS = 1024  # per requested photon
 _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
 _ALBEDO_SIDE, _EMISSION_SIDE = 2, 4  # They are means over so many rays squared in each pixel.
-# Shadow rays to each emitter: where all lamps are flat, and where not. Powers of two spread evenly.
-_SHADOW_RAYS_FLAT, _SHADOW_RAYS = 4, 16
+# With direct light, albedo is the mean over so many places in each pixel. Coarse pixels show more edges; fine ones are
+# those of a focal length of at least _FINE pixels. Powers of two spread evenly.
+_PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
+_SHADOW_RAYS = 16  # of a pixel to each emitter, unless all lamps are flat: then one from each place
 _MOST_MIRRORS = 8  # A ray is followed through at most so many mirrors and panes of glass.
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
@@ -136,16 +138,17 @@ class Renderer:
     def gbuffer(self, camera: Camera, direct: bool = False) -> dict[str, np.ndarray]:
         """Trace primary rays, and shadow rays if `direct`. They pass through the transparent parts of opacity masks.
 
-        Shadow rays start at the surface at the pixel's centre, or at the one that a mirror or pane shows there. They go
-        to four fixed points of each lamp; to 16 if there is an environment, which gets as many, or a lamp of more than
-        two triangles, of which some face away. So there is no noise, and a penumbra has a few shades.
+        Shadow rays start at eight places in each pixel, in images of some 200 pixels or more at four, or at the surface
+        that a mirror or pane shows there. They go to as many fixed points of each lamp, one from each place; to 16 if
+        there is an environment, which gets as many, or a lamp of more than two triangles, of which some face away. So
+        there is no noise, and a penumbra has a few shades.
 
         Returns:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
             radiance seen directly from lamps and from the environment, as means over each pixel's area. If `direct`,
-            also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps; and
-            mirrored_albedo (3, H, W), the albedo there times what mirrors and glass on the way let pass, or 0 where
-            there are none. A lamp in a mirror is a white surface that reflects what it emits.
+            also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps, as the
+            mean weighted by albedo; and mirrored_albedo (3, H, W), the mean albedo in mirrors and behind glass times
+            what they let pass. A lamp in a mirror is a white surface that reflects what it emits.
         """
         corners = np.floor(camera.centres()).astype(np.float32)
         lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
@@ -153,7 +156,8 @@ class Renderer:
         fixed["size"] = mi.Vector2f(camera.width, camera.height)
         dr.make_opaque(fixed["size"])
         is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
-        fixed["shadow_rays"] = direct * len(self.emitters) * (_SHADOW_RAYS_FLAT if is_flat else _SHADOW_RAYS)
+        fixed["places"] = _PLACES_FINE if camera.matrix[0, 0] >= _FINE else _PLACES_COARSE
+        fixed["shadow_rays"] = direct * len(self.emitters) * (fixed["places"] if is_flat else _SHADOW_RAYS)
         point, normal, albedo, emission, valid, *light = launch(self._gbuffer[direct], lanes, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
@@ -284,7 +288,7 @@ def _bidirectional(scene: Any, integrator: Any, sampler: Any, corner: Any, image
 
 
 def _gbuffer(
-    scene: Any, masks: bool, sky: bool, shadow_rays: int, corner: Any, lit: Any, size: Any, **camera: Any
+    scene: Any, masks: bool, sky: bool, places: int, shadow_rays: int, corner: Any, lit: Any, size: Any, **camera: Any
 ) -> tuple:
     """Return point, normal, albedo, emission, whether the ray hit, and direct light. `lit` is 0 where no lamp is seen.
 
@@ -297,11 +301,14 @@ def _gbuffer(
     if is_jit():
         dr.eval(valid, albedo)
         varies, escapes = _compare_neighbours(valid, albedo, corner, size, sky)
-    albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
+    light: Any = ()
+    if shadow_rays:
+        albedo, *light = _lit_albedo(scene, masks, places, shadow_rays, trace)
+    else:
+        albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
     lit = (lit > 0) | (escapes & sky)
 
     emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_SIDE, lit)
-    light = _direct(scene, masks, shadow_rays, centre) if shadow_rays else ()
     return centre.p, centre.sh_frame.n, albedo, emission, valid, *light
 
 
@@ -347,26 +354,54 @@ def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any
     return total / side**2
 
 
-def _direct(scene: Any, masks: bool, rays: int, surface: Any) -> tuple:
-    surface, tint, bounces = _through_mirrors(scene, surface, masks)
+def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
+    """Return the albedo, the direct light that it reflects, and the albedo in mirrors: means over places in each pixel.
+
+    The direct light is weighted by albedo. So their product is the pixel's radiance where surfaces meet, too.
+    """
+
+    def step(k: Any, albedo: Any, mirrored: Any, reflected: Any, light: Any) -> tuple:
+        first = trace(_hammersley(k, places))
+        surface, tint, bounces = _through_mirrors(scene, first, masks)
+        emission = _emission(scene, surface)
+        is_lamp = (bounces > 0) & dr.any(emission > 0)
+        # Other points of the lamps than the place's number, or places on the left would see only a lamp's left.
+        direct = places * _direct(scene, masks, rays, k ^ (places // 2), places, surface)
+        direct = dr.select(is_lamp, emission, direct)
+        own = _albedo(first)
+        seen = dr.select(bounces > 0, tint * dr.select(is_lamp, 1, _albedo(surface)), 0)
+        return k + 1, albedo + own, mirrored + seen, reflected + (own + seen) * direct, light + direct
+
+    black = mi.Color3f(0)
+    start = (mi.UInt32(0), black, black, black, black)
+    _, albedo, mirrored, reflected, light = dr.while_loop(start, lambda k, *_: k < places, step)
+    weight = albedo + mirrored
+    direct = dr.select(weight > 0, reflected / weight, light / places)
+    return albedo / places, direct, mirrored / places
+
+
+def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface: Any) -> Any:
+    """Return the part of what a white diffuse surface reflects that every `stride`-th of `rays` shadow rays finds."""
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
 
     def step(k: Any, total: Any) -> tuple:
-        # Hammersley's points; the first coordinate also chooses the emitter, and the triangle of a mesh.
-        second = mi.radical_inverse_2(k, mi.UInt32(0))  # type: ignore[arg-type]
-        place = mi.Point2f((mi.Float(k) + 0.5) / rays, second + 0.5 / rays)
+        # The first coordinate also chooses the emitter, and the triangle of a mesh.
+        place = _hammersley(k, rays)
         lamp, radiance = scene.sample_emitter_direction(surface, place, not masks, surface.is_valid())
         if masks:
             ray = surface.spawn_ray_to(lamp.p)
             radiance = dr.select(first_surface(scene, ray, masks).t < ray.maxt, 0, radiance)
-        return k + 1, total + mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0)
+        return k + stride, total + mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0)
 
-    state = (mi.UInt32(0), mi.Color3f(0))
+    state = (mi.UInt32(first), mi.Color3f(0))
     _, total = dr.while_loop(state, lambda k, total: surface.is_valid() & (k < rays), step)
-    emission = _emission(scene, surface)
-    is_lamp = (bounces > 0) & dr.any(emission > 0)
-    albedo = dr.select(bounces > 0, tint * dr.select(is_lamp, 1, _albedo(surface)), 0)
-    return dr.select(is_lamp, emission, total / (rays * dr.pi)), albedo
+    return total / (rays * dr.pi)
+
+
+def _hammersley(k: Any, count: int) -> Any:
+    """Return the k-th of `count` points that are spread evenly over the unit square."""
+    second = mi.radical_inverse_2(k, mi.UInt32(0))  # type: ignore[arg-type]
+    return mi.Point2f((mi.Float(k) + 0.5) / count, second + 0.5 / count)
 
 
 def _through_mirrors(scene: Any, surface: Any, masks: bool) -> tuple[Any, Any, Any]:

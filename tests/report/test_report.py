@@ -25,7 +25,7 @@ from nlt.metrics.quantities import QUANTITIES
 from nlt.report import page as report_page
 from nlt.report import plots
 from nlt.report.claims import write_claims
-from nlt.report.figures import draw_speed_accuracy
+from nlt.report.figures import curves, draw_speed_accuracy
 from nlt.report.gallery import Shown, draw_failures
 from nlt.report.packing import STEPS, max_error, pack, pack_to_fit
 from nlt.report.tables import write_tables
@@ -727,3 +727,20 @@ def test_too_large_for_one_file(open_report, stored, tmp_path):
     expected = (radiance(stored, "cnn") * EXPOSURE).transpose(1, 2, 0)
     within = relative(np.reshape(found, (SIZE, SIZE, 4))[..., :3], expected)
     assert within.max() <= 1.01 * max_error(steps) * (1 + max_error(steps))
+
+
+def test_sizes_are_curves(tmp_path):
+    """The sizes of a method make one curve, from the fastest on."""
+    sizes = ("tiny", "small", "medium", "large", "paper")
+    rows = {
+        f"{method}@{size}": {"time_per_frame_s": first * 2**k, "mse": 0.04 / 2**k}
+        for method, first in (("nlt_photons", 0.01), ("cnn", 0.004))
+        for k, size in enumerate(sizes)
+    }
+    results = make_results(tmp_path, rows, None)
+    assert curves(results) == {
+        "Ours (w/ photons), variants": [f"nlt_photons@{size}" for size in sizes],
+        "CNN only, variants": [f"cnn@{size}" for size in sizes],
+    }
+    draw_speed_accuracy(results)
+    assert (results.directory / "speed_accuracy.png").exists()
