@@ -298,7 +298,7 @@ def _gbuffer(
     centre = trace(0.5)
     valid, albedo = centre.is_valid(), _albedo(centre)
     varies, escapes = True, True  # A scalar kernel knows only its own pixel.
-    if is_jit():
+    if is_jit() and (sky or not shadow_rays):  # Otherwise neither is needed.
         dr.eval(valid, albedo)
         varies, escapes = _compare_neighbours(valid, albedo, corner, size, sky)
     light: Any = ()
