@@ -49,7 +49,7 @@ if [ "$scale" = small ]; then
         --suites light geometry materials camera frame --methods cnn@direct guided_1spp guided_1spp@direct \
         guided_1spp@direct_corrected guided_1spp@direct_corrected_other_rooms oidn_1 oidn_4
     once python scripts/teaser.py results/front_256 --view 8 \
-        --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct guided_1spp@direct oidn_1_balanced oidn_1
+        --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1_1@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
