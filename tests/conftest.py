@@ -91,6 +91,10 @@ def write_yaml(path, **content):
     return path
 
 
+# Where the albedo of a pixel is sampled, from its corner: (k + 0.5) / 8 and the same with the bits of k reversed.
+PLACES = (np.stack([np.arange(8), [0, 4, 2, 6, 1, 5, 3, 7]], 1) + 0.5) / 8
+
+
 def write_room(folder, scale=1.0, is_open=False, light=True, **more):
     """A white box of 2 x 2 x 2 m with a crate and a light under its ceiling, its XML `scale` times as large.
 

@@ -27,10 +27,10 @@ _MAX_LANES = 1 << 20
 _PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
 _MOST_CASTS = 1024  # per requested photon
 _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
-_ALBEDO_SIDE, _EMISSION_SIDE = 2, 4  # They are means over so many rays squared in each pixel.
-# With direct light, albedo is the mean over so many places in each pixel. Coarse pixels show more edges; fine ones are
-# those of a focal length of at least _FINE pixels. Powers of two spread evenly.
+# Albedo, direct light and emission are means over so many places in each pixel. Coarse pixels show more edges; fine
+# ones are those of a focal length of at least _FINE pixels. Powers of two spread evenly.
 _PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
+_EMISSION_PLACES = 16
 _SHADOW_RAYS = 16  # of a pixel to each emitter, unless all lamps are flat: then one from each place
 _MOST_MIRRORS = 8  # A ray is followed through at most so many mirrors and panes of glass.
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
@@ -298,17 +298,18 @@ def _gbuffer(
     centre = trace(0.5)
     valid, albedo = centre.is_valid(), _albedo(centre)
     varies, escapes = True, True  # A scalar kernel knows only its own pixel.
-    if is_jit() and (sky or not shadow_rays):  # Otherwise neither is needed.
+    if is_jit():
         dr.eval(valid, albedo)
         varies, escapes = _compare_neighbours(valid, albedo, corner, size, sky)
     light: Any = ()
     if shadow_rays:
-        albedo, *light = _lit_albedo(scene, masks, places, shadow_rays, trace)
+        mean, *light = _lit_albedo(scene, masks, places, shadow_rays, trace)
     else:
-        albedo = dr.select(varies, _pixel_mean(trace, _albedo, _ALBEDO_SIDE, varies), albedo)
+        mean = _pixel_mean(trace, _albedo, places, varies)
+    albedo = dr.select(varies, mean, albedo)
     lit = (lit > 0) | (escapes & sky)
 
-    emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_SIDE, lit)
+    emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_PLACES, lit)
     return centre.p, centre.sh_frame.n, albedo, emission, valid, *light
 
 
@@ -342,16 +343,15 @@ def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bo
     return varies, escapes
 
 
-def _pixel_mean(trace: Callable, value: Callable, side: int, active: Any) -> Any:
-    """Return the mean of the colour `value(interaction)` over side x side rays in each active pixel, else 0."""
+def _pixel_mean(trace: Callable, value: Callable, places: int, active: Any) -> Any:
+    """Return the mean of the colour `value(interaction)` over so many places in each active pixel, else 0."""
 
     def step(k: Any, total: Any) -> tuple:
-        place = (mi.Point2f(mi.Float(k % side), mi.Float(k // side)) + 0.5) / side
-        return k + 1, total + value(trace(place))
+        return k + 1, total + value(trace(_hammersley(k, places)))
 
     # An unrolled loop takes a minute to compile in a large scene and runs no faster.
-    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: active & (k < side**2), step)
-    return total / side**2
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: active & (k < places), step)
+    return total / places
 
 
 def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:

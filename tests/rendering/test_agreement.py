@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from conftest import LIGHT, plain_scene, write_room
+from conftest import LIGHT, PLACES, plain_scene, write_room
 from scipy import ndimage, stats
 
 from nlt.data.render import SampleRenderer
@@ -218,16 +218,21 @@ def sensor_of(camera, units=1.0, **more):
 def aovs(plain, camera, units):
     """Return Mitsuba's AOVs, each (..., H, W): depth along the axis in metres and normal at the pixel centres; albedo.
 
-    The albedo is the mean of 2 x 2 rays in each pixel.
+    The albedo is the mean of eight rays in each pixel, for which the sensor is shifted.
     """
     integrator = mi.load_dict({"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo"})
 
-    def split(spp):
-        sensor = sensor_of(camera, units, sampler={"type": "stratified", "sample_count": spp, "jitter": False})
-        image = np.array(mi.render(plain, sensor=sensor, integrator=integrator, spp=spp))
+    def split(x=0.5, y=0.5):
+        shift = {"principal_point_offset_x": (0.5 - x) / camera.width}
+        shift["principal_point_offset_y"] = (0.5 - y) / camera.height
+        sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
+        image = np.array(
+            mi.render(plain, sensor=sensor_of(camera, units, sampler=sampler, **shift), integrator=integrator, spp=1)
+        )
         return np.split(np.moveaxis(image, 2, 0)[-9:].astype(float), 3)
 
-    (position, normal, _), (_, _, albedo) = split(1), split(4)
+    position, normal, _ = split()
+    albedo = np.mean([split(*place)[2] for place in PLACES], axis=0)
     depth = np.einsum("i,ihw->hw", camera.rotation[:, 2], position / units - camera.position[:, None, None])
     return np.where(normal.any(0), depth, 0), normal, albedo
 
