@@ -100,8 +100,10 @@ def test_direct_light(tmp_path):
     renderer = Renderer(Scene(description, "fixed_lights"))
     view = np.array([-0.9, 1.2, -0.6]), np.array([-0.6, 0, 0.2]), np.array([0, 1.0, 0]), 60
     camera, fine = Camera.look_at(*view, 72, 72), Camera.look_at(*view, 72 * side, 72 * side)
-    direct = renderer.gbuffer(camera, direct=True)["direct"]
+    lit = renderer.gbuffer(camera, direct=True)
+    direct = lit["direct"]
     assert np.array_equal(renderer.gbuffer(camera, direct=True)["direct"], direct), "it has no noise"
+    np.testing.assert_allclose(renderer.gbuffer(camera)["albedo"], lit["albedo"], atol=1e-6)
     rows = lambda image: image.reshape(len(image), -1).T.astype(float)
     buffer = renderer.gbuffer(fine)
     directions, normal, albedo = rows(fine.view_directions()), rows(buffer["normal"]), rows(buffer["albedo"])
