@@ -5,6 +5,7 @@ All results are numpy arrays in metres, world coordinates and linear, unclamped 
 
 import itertools
 import logging
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -305,11 +306,11 @@ def _gbuffer(
     if shadow_rays:
         mean, *light = _lit_albedo(scene, masks, places, shadow_rays, trace)
     else:
-        mean = _pixel_mean(trace, _albedo, places, varies)
+        mean = _pixel_mean(trace, _albedo, _hammersley, places, varies)
     albedo = dr.select(varies, mean, albedo)
     lit = (lit > 0) | (escapes & sky)
 
-    emission = _pixel_mean(trace, partial(_emission, scene), _EMISSION_PLACES, lit)
+    emission = _pixel_mean(trace, partial(_emission, scene), _grid, _EMISSION_PLACES, lit)
     return centre.p, centre.sh_frame.n, albedo, emission, valid, *light
 
 
@@ -343,15 +344,15 @@ def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bo
     return varies, escapes
 
 
-def _pixel_mean(trace: Callable, value: Callable, places: int, active: Any) -> Any:
-    """Return the mean of the colour `value(interaction)` over so many places in each active pixel, else 0."""
+def _pixel_mean(trace: Callable, value: Callable, place: Callable, count: int, active: Any) -> Any:
+    """Return the mean of the colour `value(interaction)` over `place(k, count)` in each active pixel, else 0."""
 
     def step(k: Any, total: Any) -> tuple:
-        return k + 1, total + value(trace(_hammersley(k, places)))
+        return k + 1, total + value(trace(place(k, count)))
 
     # An unrolled loop takes a minute to compile in a large scene and runs no faster.
-    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: active & (k < places), step)
-    return total / places
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda k, total: active & (k < count), step)
+    return total / count
 
 
 def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
@@ -398,10 +399,16 @@ def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface
     return total / (rays * dr.pi)
 
 
+def _grid(k: Any, count: int) -> Any:
+    """Return the k-th of `count` points of a square grid in the unit square."""
+    side = math.isqrt(count)
+    return (mi.Point2f(mi.Float(k % side), mi.Float(k // side)) + 0.5) / side
+
+
 def _hammersley(k: Any, count: int) -> Any:
     """Return the k-th of `count` points that are spread evenly over the unit square."""
-    second = mi.radical_inverse_2(k, mi.UInt32(0))  # type: ignore[arg-type]
-    return mi.Point2f((mi.Float(k) + 0.5) / count, second + 0.5 / count)
+    reversed_bits = mi.Float(dr.brev(mi.UInt32(k))) / 2**32
+    return mi.Point2f((mi.Float(k) + 0.5) / count, reversed_bits + 0.5 / count)
 
 
 def _through_mirrors(scene: Any, surface: Any, masks: bool) -> tuple[Any, Any, Any]:
