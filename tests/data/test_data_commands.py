@@ -96,7 +96,7 @@ def test_everything_wrong_is_found(verify):
     points = load_file(directory / "points-000.safetensors")
     save_file({**points, "albedo": points["albedo"].astype(np.float16)}, directory / "points-000.safetensors")
     (directory / "manifest.json").write_text(
-        (directory / "manifest.json").read_text().replace(f'"format": {FORMAT}', '"format": 7')
+        (directory / "manifest.json").read_text().replace(f'"format": {FORMAT}', f'"format": {FORMAT + 1}')
     )
     code, findings, error = run()
     assert code == 2 and re.search(r"^nlt: error: .*: 12 findings; delete .*nlt generate", error)

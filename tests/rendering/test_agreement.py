@@ -88,7 +88,7 @@ def passes_crate(start, end):
 
 
 def lit_by_lamp(place, normal):
-    """Return the light that white reflects, per radiance (n,), and the share of the lamp in sight (n,), by 256 parts."""
+    """Return the light that white reflects, per radiance (n,), and the lamp's share in sight (n,), by 256 parts."""
     (width, depth), y, parts = LIGHT["size"], LIGHT["height"], (np.arange(16) + 0.5) / 16 - 0.5
     total, seen = np.zeros(len(place)), np.zeros(len(place))
     for x in width * parts:
