@@ -28,8 +28,8 @@ _MAX_LANES = 1 << 20
 _PILOT = 1 << 15  # photons cast per emitter to estimate how many arrive
 _MOST_CASTS = 1024  # per requested photon
 _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wall from outside do not cross it
-# Albedo and direct light are means over so many places in each pixel. Coarse pixels show more edges; fine ones are those
-# of a focal length of at least _FINE pixels. Powers of two spread evenly.
+# Albedo and direct light are means over so many places in each pixel. Coarse pixels show more edges; fine ones are
+# those of a focal length of at least _FINE pixels. Powers of two spread evenly.
 _PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
 _EMISSION_PLACES = 16
 _SHADOW_RAYS = 16  # of a pixel to each emitter, unless all lamps are flat: then one from each place
