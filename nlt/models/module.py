@@ -102,9 +102,10 @@ class RenderingModule(Method, L.LightningModule):
                 as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
-            direct_light: methods that read the G-buffer also read the direct light and the albedo of what mirrors and
-                clear glass show, which the renderer gives without noise (`Renderer.direct`); with "demodulated", the
-                output adds albedo times direct light, so that the network predicts the rest. Not in the paper.
+            direct_light: also read the direct light and the albedo of what mirrors and clear glass show, which the
+                renderer gives without noise (`Renderer.gbuffer`); with "demodulated", the output adds albedo times
+                direct light, so that the network predicts the rest. Only for methods that read the G-buffer; not in the
+                paper.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
                 biases and the embeddings (nlt/models/muon.py).
@@ -121,6 +122,9 @@ class RenderingModule(Method, L.LightningModule):
         if not 0 <= clip_share <= 1:
             raise UserError(f"model.init_args.clip_share: must be between 0 and 1, is {clip_share}")
         self.save_hyperparameters()
+        if direct_light and not self.reads_direct_light:
+            name = type(self).__name__
+            raise UserError(f"model.init_args.direct_light: {name} does not read the G-buffer; leave it out")
         self.loss = getattr(losses, loss)
         # channels_last is the fastest layout of the convolutions.
         unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)

@@ -159,6 +159,12 @@ def test_direct_light(config):
     torch.testing.assert_close(features[:, changed], expected)
 
 
+@pytest.mark.parametrize("name", ["denoising_1_1", "ablation_1"])
+def test_direct_light_without_a_gbuffer(name):
+    with pytest.raises(UserError, match=r"model.init_args.direct_light: .* does not read the G-buffer"):
+        build(find_config("model", name), find_config("variant", "direct"))
+
+
 def test_doubled_exposure_of_halved_light(method):
     """Exposed radiance is all the network sees, so the prediction only halves."""
     batch = synthetic_batch()
