@@ -1,8 +1,8 @@
-"""Checks whether `nlt select` picks the model that a scene needs, in three scenes, and what each pick saves.
+"""Checks whether `nlt select` picks the model that a scene needs, in five scenes, and what each pick saves.
 
     python benchmarks/selection.py --minutes 6
 
-Runs `nlt select` for a static scene, a room with fixed lights and one with a moving light, and writes summary.md and
+Runs `nlt select` for two static scenes, a room with fixed lights and two with a moving light, and writes summary.md and
 summary.csv: each pick against always taking the full model and against picking by the number of parameters. A claim
 that does not hold is printed as failing. A complete selection is not repeated.
 """
@@ -19,8 +19,8 @@ from nlt.data.files import write_bytes
 from nlt.evaluation.results import read_rows, write_rows
 from nlt.select.output import summary
 
-# Directory below results/select: config of configs/select.
-CASES = {"static_egg": "static_egg", "fixed_lights": "fixed_lights", "moving_lights": "demo"}
+# In configs/select.
+CASES = ("static_egg", "static_kitchen", "fixed_lights", "demo", "real_living_room")
 
 
 def main() -> None:
@@ -29,11 +29,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/select"))
     options = parser.parse_args()
     confirmed: dict[str, list[dict[str, Any]]] = {}
-    for case, config in CASES.items():
+    for case in CASES:
         directory = options.out / case
         if not (directory / "front.svg").exists():
             minutes = [f"--minutes={options.minutes}"] if options.minutes else []
-            command = [sys.executable, "-m", "nlt.cli", "select", "--config", config, "--out", str(directory), *minutes]
+            command = [sys.executable, "-m", "nlt.cli", "select", "--config", case, "--out", str(directory), *minutes]
             subprocess.run(command, check=True)  # own processes: Mitsuba's memory grows with every scene
         confirmed[case] = read_rows(directory / "confirmed.csv")
     write_rows(options.out / "summary.csv", [{"case": case, **row} for case, rows in confirmed.items() for row in rows])

@@ -1,11 +1,12 @@
 """Make a model of `nlt render --demo` from a finished training: safetensors, and a card of its origin and metrics.
 
     nlt generate --config data/demo --config scale/pretrained
-    for METHOD in guided_1spp nlt_photons; do
-        nlt fit --config data/demo --config model/$METHOD --config scale/pretrained \
-            --trainer.default_root_dir runs/pretrained/$METHOD
-        python scripts/pretrained.py runs/pretrained/$METHOD/lightning_logs/version_0/checkpoints/*.ckpt \
-            $(git rev-parse HEAD)
+    nlt fit --config data/demo --config model/guided_1spp --config scale/pretrained --config variant/direct_corrected \
+        --trainer.default_root_dir runs/pretrained/guided_1spp@direct_corrected
+    nlt fit --config data/demo --config model/nlt_photons --config scale/pretrained \
+        --trainer.default_root_dir runs/pretrained/nlt_photons
+    for run in runs/pretrained/*; do
+        python scripts/pretrained.py $run/lightning_logs/version_0/checkpoints/*.ckpt $(git rev-parse HEAD)
     done
 """
 
@@ -30,7 +31,8 @@ def main(checkpoint: str, commit: str) -> None:
     run_folder = Path(checkpoint).absolute().parents[1]
     name = run_folder.parents[1].name
     (file,) = (Path(path) for path in DEMO.values() if Path(path).stem == name)
-    used = ("data/demo", f"model/{name}", "scale/pretrained")
+    model, _, variant = name.partition("@")
+    used = ["data/demo", f"model/{model}", "scale/pretrained", *([f"variant/{variant}"] if variant else [])]
     begun, configs = origin(), [f"--config={config}" for config in used]
     run = read_configs([str(run_folder / "config.yaml")])
     seconds = Path(checkpoint).stat().st_mtime - (run_folder / "config.yaml").stat().st_mtime
