@@ -57,6 +57,11 @@ def _points(results: Results, key: str) -> dict[str, tuple[float, float]]:
 def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[str, Sequence[str]]) -> None:
     """Draw a metric over time; `families` has the methods of each curve."""
     points = _points(results, key)
+    if is_linear := METRICS[key].direction == "higher":
+        far = far_behind(results, key)
+        points = {method: point for method, point in points.items() if method not in far}
+        words = f"not shown: {', '.join(map(label, far))}" if far else ""
+        axis.text(0.98, 0.03, words, fontsize=6, ha="right", transform=axis.transAxes)
     plots.draw_front(axis, points, METRICS[key].direction)
     for k, (name, members) in enumerate(families.items()):
         colour = _CURVES[k % len(_CURVES)]
@@ -64,12 +69,11 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
         _plot(axis, results, key, {m: points[m] for m in drawn}, label=name, color=colour, ls=plots.DASHES[k % 4],
               marker="x+."[k % 3])  # fmt: skip
         for number, m in enumerate(drawn):
-            setting = m.partition("@")[2] or label(m).partition("(")[2].rstrip(")").removesuffix(" spp")
-            plots.annotate(axis, setting, points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
+            plots.annotate(axis, setting(m), points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
     for k, m in enumerate(_alone(results, families)):
         point = {m: points[m]} if m in points else {}
         _plot(axis, results, key, point, label=label(m), ls="", mec="white", mew=0.6, zorder=3, **plots.style(k))
-    if METRICS[key].direction == "lower":  # else a single path-traced row would press all others together
+    if not is_linear:
         axis.set_yscale("log")
         _set_ticks(axis.yaxis)
     axis.margins(0.09, 0.12)
@@ -117,6 +121,21 @@ def curves(results: Results) -> dict[str, list[str]]:
             varied = "spp" if len({runs[m]["spp"] for m in members}) > 1 else "pixels traced"
             joined[f"{label(members[0]).partition(' (')[0]} ({varied})"] = sorted(members, key=rays)
     return joined
+
+
+def far_behind(results: Results, key: str) -> list[str]:
+    """Return the methods that a linear axis leaves out, because they would press all others together.
+
+    They are ten times as far below the best value of the metric `key` as the median method.
+    """
+    values = {m: value for m in results.methods if math.isfinite(value := results.mean(m, key))}
+    gaps = {method: max(values.values()) - value for method, value in values.items()}
+    return [method for method, gap in gaps.items() if gap > 10 * np.median(list(gaps.values())) > 0]
+
+
+def setting(method: str) -> str:
+    """Return what tells a method from the others of its curve: its variant, or its pixels or samples per pixel."""
+    return method.partition("@")[2] or label(method).partition("(")[2].rstrip(")").removesuffix(" spp")
 
 
 def _alone(results: Results, families: Mapping[str, Sequence[str]]) -> list[str]:

@@ -23,7 +23,7 @@ from nlt.evaluation.results import OK, TIMES, Results
 from nlt.metrics.quantities import METRICS, QUANTITIES, STAGES, heading, text
 from nlt.report.claims import BELOW_FLOOR
 from nlt.report.claims import text as claim_text
-from nlt.report.figures import bar, curves
+from nlt.report.figures import bar, curves, far_behind, setting
 from nlt.report.gallery import FAILURES, Shown, failures
 from nlt.report.packing import SMALLEST, data_url, max_error, pack_to_fit
 from nlt.report.table_writer import Table
@@ -149,6 +149,7 @@ def _quantities(results: Results) -> dict[str, dict[str, Any]]:
             "unit": quantity.unit,
             "role": "metric" if key in METRICS and key != "reference_noise" else "cost" if key in _AXES else "",
             "per_image": quantity.per_image,
+            "far": far_behind(results, key) if quantity.direction == "higher" else [],
         }
         for key, quantity in QUANTITIES.items()
         if any(len(on.values(method, key)) for on in everywhere for method in results.methods)
@@ -164,6 +165,7 @@ def _methods(results: Results) -> list[dict[str, Any]]:
         {
             "id": method,
             "label": label(method),
+            "setting": setting(method),
             "status": results.status(method),
             "command": _command(results, method),
             "values": _values(results, method, others),

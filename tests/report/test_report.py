@@ -396,7 +396,8 @@ def test_trouble_is_shown(open_report):
     row = page.locator("#table-0 tbody tr", has_text=f"{ODD} [2 of 2 failed]")
     assert set(row.locator("td").all_text_contents()) == {"–"}
     assert "it <b>broke</b>" in page.locator("#runs").inner_text()
-    assert f"Not shown: {ODD} (2 of 2 failed)." in page.locator("#chart-note").inner_text()
+    missing = f"Not shown: Path tracing (4 spp) (far behind), {ODD} (2 of 2 failed)."
+    assert missing in page.locator("#chart-note").inner_text()
     assert "FLIP ↓" not in page.locator("#chart-y option").all_text_contents()
     assert page.locator("#a option").count() == len(TROUBLED) + 4
 
@@ -485,6 +486,7 @@ def test_device(open_report):
     page = open_report().page
     code = "all => all.map(p => [p.dataset.method, Number(p.querySelector('.ring').getAttribute('cx'))])"
     at = lambda: dict(page.locator("#chart .point").evaluate_all(code))
+    page.select_option("#chart-y", "mse")
     here = at()
     assert page.locator("#device option").all_text_contents() == ["CPU, made up", GPU]
     page.select_option("#device", label=GPU)
@@ -637,7 +639,8 @@ def test_chart(open_report, stored):
     for key, log in (("mssim", False), ("mse", True), ("fid", True)):
         page.select_option("#chart-y", key)
         at = places()
-        assert set(at) == set(TROUBLED)
+        # The linear axis leaves out path tracing, whose MSSIM is 0.15 where the others have 0.8 to 0.9.
+        assert set(at) == set(TROUBLED) - ({"path_tracing_4"} if key == "mssim" else set())
         value = lambda m, key=key: float(rows[m][key])
         x = np.log([float(rows[m]["time_per_frame_s"]) for m in at])
         assert np.corrcoef(x, [p[0] for p in at.values()])[0, 1] == pytest.approx(1, abs=1e-6)
@@ -647,7 +650,8 @@ def test_chart(open_report, stored):
         assert max(straight) == pytest.approx(1, abs=1e-6), (key, log)
         sign = 1 if QUANTITIES[key].direction == "lower" else -1
         seconds = lambda m: float(rows[m]["time_per_frame_s"])
-        front = [m for m in at if not any(seconds(o) < seconds(m) and sign * value(o) <= sign * value(m) for o in at)]
+        points = {m: (seconds(m), sign * value(m)) for m in TROUBLED}
+        front = [m for m, (x, y) in points.items() if not any(s < x and t <= y for s, t in points.values())]
         listed = page.locator("#budget button").evaluate_all("buttons => buttons.map(b => b.dataset.method)")
         assert listed == sorted(front, key=seconds)
     page.locator("#chart .point[data-method=cnn]").click()

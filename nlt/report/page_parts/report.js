@@ -119,7 +119,7 @@ const families = [...new Set(data.methods.map(familyOf))];
 for (const method of data.methods) {
   const k = families.indexOf(familyOf(method));
   Object.assign(method, { number: k + 1, colour: `var(--c${k % 7})`, marker: MARKERS[k % 7], dash: ["none", "6 3", "2 3"][k % 3] });
-  method.short = (method.curve && /\((.*)\)/.exec(method.label)?.[1]) || method.label;
+  method.short = method.curve ? method.setting : method.label;
 }
 
 // Returns the Pareto-optimal points, in order of cost.
@@ -162,17 +162,18 @@ function drawChart() {
   const W = Math.max(300, $("chart").clientWidth), H = clamp(W * 0.5, 330, 480), narrow = W < 560;
   const [left, right, top, bottom] = [58, W - 14, 26, H - 40];
   const onAllDevices = data.methods.flatMap((method) => method.times.map((times) => times[xKey]?.[0] * xQ.scale)).filter((x) => x > 0);
-  const xs = [...points.map((p) => p.x), ...onAllDevices], ys = points.flatMap((p) => [p.low, p.high]);
+  const shown = points.filter((p) => !yQ.far.includes(p.method.id));
+  const xs = [...points.map((p) => p.x), ...onAllDevices], ys = shown.flatMap((p) => [p.low, p.high]);
   const yLog = yQ.unit === "1" && Math.min(...ys) > 0 && Math.max(...ys) / Math.min(...ys) > 20;
   const xAxis = makeAxis(padded(xs, true), [left, right], 6, true);
   const yAxis = makeAxis(padded(ys, yLog), [bottom, top], 6, yLog);
   for (const p of points) [p.px, p.py] = [xAxis.at(p.x), yAxis.at(p.y)];
 
-  const front = paretoFront(points, signOf(yKey));
+  const front = paretoFront(points, signOf(yKey)), shownFront = paretoFront(shown, signOf(yKey));
   const label = ({ method }) => (narrow && !method.curve ? String(method.number) : method.short);
-  const boxes = placeLabels(points, (p) => 6.6 * label(p).length, [left, top, W, bottom]);
-  const step = front.map((p, k) => (k ? `H${p.px}V${p.py}` : `M${p.px},${p.py}`)).join("") + `H${right}`;
-  const lines = Object.values(data.curves).map((members) => members.map((id) => points.find((p) => p.method.id === id)).filter(Boolean));
+  const boxes = placeLabels(shown, (p) => 6.6 * label(p).length, [left, top, W, bottom]);
+  const step = shownFront.map((p, k) => (k ? `H${p.px}V${p.py}` : `M${p.px},${p.py}`)).join("") + `H${right}`;
+  const lines = Object.values(data.curves).map((members) => members.map((id) => shown.find((p) => p.method.id === id)).filter(Boolean));
   $("chart").innerHTML = `<svg viewBox="0 0 ${W} ${H}" role="group" aria-label="${escapeText(yQ.heading)} over ${escapeText(xQ.axis)}">
     ${xAxis.ticks.map((tick) => gridColumn(xAxis, tick, [bottom, top])).join("")}
     ${yAxis.ticks.map((tick) => gridRow(yAxis, tick, [left, right])).join("")}
@@ -180,12 +181,13 @@ function drawChart() {
     <text x="4" y="14">${escapeText(yQ.heading)}${yLog ? ", log" : ""}</text>
     <path d="${step}" fill="none" stroke="var(--front)" stroke-width="6" stroke-linejoin="round"/>
     ${lines.filter((line) => line.length).map(drawCurve).join("")}
-    ${points.map((p, k) => drawPoint(p, label(p), boxes[k], yAxis, xQ, yQ)).join("")}</svg>${legend(points, narrow)}`;
-  const absent = data.methods.filter((method) => !has(method));
+    ${shown.map((p, k) => drawPoint(p, label(p), boxes[k], yAxis, xQ, yQ)).join("")}</svg>${legend(shown, narrow)}`;
+  const absent = data.methods.filter((method) => !shown.some((p) => p.method === method));
+  const reason = (method) => (method.status !== "ok" ? method.status : has(method) ? "far behind" : "not measured");
   const hasBars = points.some((p) => p.high > p.low);
   $("chart-note").textContent = "Grey: Pareto front. Higher is better for ↑, lower for ↓. Click on a point to show its images."
     + (hasBars ? " Bars: standard deviation over seeds or, with one seed, the 95% interval over test views." : "")
-    + (absent.length ? ` Not shown: ${absent.map((m) => `${m.label} (${m.status === "ok" ? "not measured" : m.status})`).join(", ")}.` : "");
+    + (absent.length ? ` Not shown: ${absent.map((m) => `${m.label} (${reason(m)})`).join(", ")}.` : "");
   $("budget").innerHTML = front.map((p) => `<li>from ${plain(p.x)} ${escapeText(xQ.unit === "1" ? "" : xQ.unit)} up:
     <button type="button" data-method="${escapeText(p.method.id)}">${escapeText(p.method.label)}</button>,
     ${escapeText(yQ.heading)} ${escapeText(p.text)}</li>`).join("");
