@@ -46,8 +46,8 @@ if [ "$scale" = small ]; then
         guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
         oidn_1_balanced oidn_1 oidn_4
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
-        --suites light geometry materials camera frame --methods cnn@direct guided_1spp guided_1spp@direct \
-        guided_1spp@direct_corrected guided_1spp@direct_corrected_other_rooms oidn_1 oidn_4
+        --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
+        guided_1spp@direct_corrected oidn_1 oidn_4
     once python scripts/teaser.py results/front_256 --view 8 \
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
@@ -55,6 +55,12 @@ if [ "$scale" = small ]; then
         guided_1_1@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1 oidn_4
+    once nlt stress --config demo --out results/trainings_builtin --suites training \
+        --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
+    once nlt compare --config ablation_real --scale ablation --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
+    once nlt compare --config front --data real_kitchen --scale static --seeds 3 --workers "${WORKERS:-2}" \
+        --out results/static_kitchen --methods cnn cnn@direct feature_projection nlt nlt@radiance \
+        guided_1spp@direct_corrected oidn_1_balanced oidn_1 oidn_4 path_tracing_1
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
