@@ -13,7 +13,7 @@ from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-TITLES = {"table1": "Claims on Table 1", "table2": "Claims on Table 2"}
+TITLES = {"table1": "Claims on Table 1", "table2": "Claims on Table 2", "ablation": "Claims on the ablation"}
 
 
 def tables() -> str:

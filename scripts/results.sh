@@ -57,7 +57,7 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1 oidn_4
     once nlt stress --config demo --out results/trainings_builtin --suites training \
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
-    once nlt compare --config ablation_real --scale ablation --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
+    once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
     once nlt compare --config front --data real_kitchen --scale static --seeds 3 --workers "${WORKERS:-2}" \
         --out results/static_kitchen --methods cnn cnn@direct feature_projection nlt nlt@radiance \
         guided_1spp@direct_corrected oidn_1_balanced oidn_1 oidn_4 path_tracing_1
