@@ -377,7 +377,7 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
     start = (mi.UInt32(0), black, black, black, black)
     _, albedo, mirrored, reflected, light = dr.while_loop(start, lambda k, *_: k < places, step)
     weight = albedo + mirrored
-    direct = dr.select(weight > 0, reflected / weight, light / places)
+    direct = dr.select(weight > 0, reflected / dr.maximum(weight, 1e-9), light / places)
     return albedo / places, direct, mirrored / places
 
 
@@ -392,6 +392,11 @@ def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface
         if masks:
             ray = surface.spawn_ray_to(lamp.p)
             radiance = dr.select(first_surface(scene, ray, masks).t < ray.maxt, 0, radiance)
+        # A ray stands for a part of the lamp. Seen from nearby, a disk of that area covers less than a point's square
+        # law says, and at most all that is above the surface.
+        is_area = mi.has_flag(lamp.emitter.flags(), mi.EmitterFlags.Surface)
+        parts = dr.pi * rays * lamp.pdf  # so many would cover all above the surface
+        radiance = dr.select(is_area, radiance * parts / (1 + parts), radiance)
         return k + stride, total + mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0)
 
     state = (mi.UInt32(first), mi.Color3f(0))

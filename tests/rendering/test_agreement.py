@@ -147,6 +147,16 @@ def test_direct_light(tmp_path):
     assert error(ours) < 0.8 * error(centre)
 
 
+def test_direct_light_next_to_the_lamp(tmp_path, monkeypatch):
+    """A surface reflects no more radiance than a lamp emits, however close the lamp's points are."""
+    monkeypatch.setitem(LIGHT, "height", 0.03)
+    description = load_description(str(write_room(tmp_path)))
+    below = Camera.look_at(np.array([0.9, 0.02, 0.0]), np.array([0, 0, 0.0]), np.array([0, 1.0, 0]), 10, 64, 64)
+    direct = Renderer(Scene(description, "fixed_lights")).gbuffer(below, direct=True)["direct"]
+    share = direct / np.reshape(LIGHT["radiance"], (3, 1, 1))
+    assert 0.5 < share.max() < 1.2
+
+
 def test_direct_light_of_the_sky(tmp_path):
     """A white floor under a sky of one colour reflects nearly that colour, and nothing in the dark."""
     source = tmp_path / "scene.xml"

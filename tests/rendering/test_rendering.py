@@ -626,22 +626,42 @@ def test_probe():
     assert not variant_module._works("llvm_ad_rgb", "/dev/null")
 
 
-def test_scalar_agrees(renderer, demo):
-    """The scalar variant has the same expectation as the variant that runs here, also in a window of an image."""
-    code = (
-        "import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()\n"
-        "from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene\n"
-        "from nlt.scenes.description import load_description; from nlt.scenes.state import rest_state, sample_view\n"
-        "d = load_description('living_room'); r = Renderer(Scene(d, 'moving_lights'))\n"
-        "r.scene.set_state(rest_state(d, 'moving_lights'))\n"
-        "c = sample_view(d, 20, np.random.default_rng(7)).window(7, 1, 12)\n"
-        "np.save(sys.stdout.buffer, np.stack([r.radiance(c, 8, s) for s in range(40)]))\n"
-    )
+IN_SCALAR = """
+import numpy as np, sys; from nlt.rendering.variant import use_variant; use_variant()
+from nlt.rendering.renderer import Renderer; from nlt.scenes.assembly import Scene
+from nlt.scenes.description import load_description; from nlt.scenes.state import rest_state, sample_view
+d = load_description('living_room'); r = Renderer(Scene(d, 'moving_lights'))
+r.scene.set_state(rest_state(d, 'moving_lights'))
+c = sample_view(d, 20, np.random.default_rng({view})).window(*{corner}, 12)
+"""
+
+
+def in_scalar(images, *shape, **camera):
+    """An expression's float32 values (*shape, 12, 12), of renderer `r` and camera `c` in the scalar variant."""
+    code = IN_SCALAR.format(**camera) + f"np.save(sys.stdout.buffer, np.stack({images}).astype(np.float32))"
     environment = dict(os.environ, NLT_VARIANT="scalar_rgb")
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
-    images = np.frombuffer(done.stdout[-40 * 3 * 144 * 4 :], np.float32).reshape(40, 3, 12, 12)
+    return np.frombuffer(done.stdout[-int(np.prod(shape)) * 144 * 4 :], np.float32).reshape(*shape, 12, 12)
+
+
+def test_scalar_agrees(renderer, demo):
+    """The scalar variant has the same expectation as the variant that runs here, also in a window of an image."""
+    images = in_scalar("[r.radiance(c, 8, s) for s in range(40)]", 40, 3, view=7, corner=(7, 1))
     scalar = np.einsum("xc,nchw->nxhw", XYZ, images)
     renderer.scene.set_state(rest_state(demo, "moving_lights"))
     window = sample_view(demo, 20, np.random.default_rng(7)).window(7, 1, 12)
     ours = samples_of(renderer, window, 8, range(50, 90))
     assert p_value(ours, scalar.mean(0), scalar.var(0, ddof=1) / 40) > ALPHA
+
+
+def test_scalar_gbuffer_agrees(renderer, demo):
+    """Both variants trace the same rays, mirrors and shadow rays included, but for rounding at edges."""
+    names, at = ("albedo", "direct", "mirrored_albedo", "normal", "emission"), {"view": 3, "corner": (0, 0)}
+    scalar = in_scalar(f"[r.gbuffer(c, True)[name] for name in {names}]", len(names), 3, **at)
+    renderer.scene.set_state(rest_state(demo, "moving_lights"))
+    window = sample_view(demo, 20, np.random.default_rng(at["view"])).window(*at["corner"], 12)
+    ours = renderer.gbuffer(window, direct=True)
+    weight = ours["albedo"] + ours["mirrored_albedo"]
+    assert not weight.all() and ours["mirrored_albedo"].any(), "the window shows neither a black surface nor a mirror"
+    for name, theirs in zip(names, scalar, strict=True):
+        assert (np.abs(ours[name] - theirs) < 1e-3 * (1 + np.abs(theirs))).mean() > 0.95, name
