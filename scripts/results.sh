@@ -79,7 +79,7 @@ if [ "$scale" = small ]; then
     done
     once nlt compare --config recipe --workers "${WORKERS:-2}" --methods $parts --out results/recipe_methods
     for method in feature_projection nlt photons_only guided_1_1; do
-        parts="$parts $method@clipped $method@no_emission"
+        parts="$parts $method@no_emission"
     done
     once nlt compare --config recipe --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/recipe_demo \
         --methods $parts feature_projection@slow_embedding nlt@slow_embedding

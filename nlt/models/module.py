@@ -89,7 +89,6 @@ class RenderingModule(Method, L.LightningModule):
         learning_rate: float = 5e-4,
         lr_schedule: Literal["paper", "cosine"] = "paper",
         lr_decay: float = 0.99,
-        clip_share: float = 1.0,
         seed: int = 0,
     ) -> None:
         """The defaults are the paper's.
@@ -113,14 +112,11 @@ class RenderingModule(Method, L.LightningModule):
             lr_schedule: "paper" multiplies the rate by `lr_decay` after each epoch. "cosine" changes it at every step:
                 a linear warm-up over the first 5 % of the steps, then half a cosine down to zero.
             lr_decay: factor on the learning rate after each epoch, with the schedule "paper".
-            clip_share: share of the steps, from the first on, in which the trainer's gradient_clip_val applies.
             seed: seed of the random numbers that a method draws in training.
         """
         super().__init__()
         check_at_least(1, width=width)
         check_at_least(0, depth=depth)
-        if not 0 <= clip_share <= 1:
-            raise UserError(f"model.init_args.clip_share: must be between 0 and 1, is {clip_share}")
         self.save_hyperparameters()
         if direct_light and not self.reads_direct_light:
             name = type(self).__name__
@@ -284,12 +280,11 @@ class RenderingModule(Method, L.LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: Any = None, gradient_clip_algorithm: Any = None
     ) -> None:
-        """Clip gradients as the trainer is configured, in the first `clip_share` of the steps.
+        """Clip gradients as the trainer is configured.
 
         Lightning's own method rejects a fused Adam in mixed precision, which is safe here because no loss is scaled.
         """
-        share = self.hparams["clip_share"]
-        if gradient_clip_val and (share == 1 or self.global_step < share * self.trainer.estimated_stepping_batches):
+        if gradient_clip_val:
             clip = clip_grad_value_ if gradient_clip_algorithm == "value" else clip_grad_norm_
             clip(self.parameters(), gradient_clip_val)
 

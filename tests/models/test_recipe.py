@@ -13,7 +13,6 @@ from torch.utils.data import DataLoader
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.feature_projection import FeatureProjection
-from nlt.errors import UserError
 from nlt.models.module import warm_up_and_cosine
 from nlt.models.muon import Muon, orthogonalize
 from nlt.models.nlt import NeuralLightTransport
@@ -91,20 +90,12 @@ class _StopAfter(L.Callback):
         trainer.should_stop = trainer.global_step >= self.steps
 
 
-def test_gradients_are_clipped_in_the_warm_up_alone(tmp_path):
-    rates, share = Rates(), 0.5
-    model = CNN(width=4, clip_share=share)
+def test_gradients_are_clipped(tmp_path):
+    rates = Rates()
     L.Trainer(default_root_dir=tmp_path, max_steps=8, gradient_clip_val=1e-3, callbacks=[rates], **QUIET).fit(
-        model, loader(8)
+        CNN(width=4), loader(8)
     )
-    assert all(norm == pytest.approx(1e-3, rel=1e-3) for norm in rates.norms[:4])
-    assert all(norm > 2e-3 for norm in rates.norms[4:])
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5])
-def test_a_share_is_between_0_and_1(share):
-    with pytest.raises(UserError, match=r"model\.init_args\.clip_share: must be between 0 and 1"):
-        CNN(width=1, clip_share=share)
+    assert rates.norms == pytest.approx([1e-3] * 8, rel=1e-3)
 
 
 def test_a_demodulated_output():
