@@ -30,7 +30,7 @@ def main(checkpoint: str, commit: str) -> None:
     """Evaluate a checkpoint that was trained at `commit` and write it to where `nlt render --demo` finds it."""
     run_folder = Path(checkpoint).absolute().parents[1]
     name = run_folder.parents[1].name
-    (file,) = (Path(path) for path in DEMO.values() if Path(path).stem == name)
+    file = Path(next(iter(DEMO.values()))).with_name(f"{name}.safetensors")
     model, _, variant = name.partition("@")
     used = ["data/demo", f"model/{model}", "scale/pretrained", *([f"variant/{variant}"] if variant else [])]
     begun, configs = origin(), [f"--config={config}" for config in used]
