@@ -32,7 +32,7 @@ from nlt.scenes.state import SceneState
 _PRETRAINED = Path(__file__).with_name("pretrained")
 # The models that come with nlt, by the name that is shown; the first is the better one.
 DEMO = {
-    "Guided (1 spp)": str(_PRETRAINED / "guided_1spp.safetensors"),
+    "Guided (1 spp), direct": str(_PRETRAINED / "guided_1spp@direct_corrected.safetensors"),
     "the paper's full model": str(_PRETRAINED / "nlt_photons.safetensors"),
 }
 DEMO_SCENE = "living_room"
