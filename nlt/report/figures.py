@@ -126,11 +126,11 @@ def curves(results: Results) -> dict[str, list[str]]:
 def far_behind(results: Results, key: str) -> list[str]:
     """Return the methods that a linear axis leaves out, because they would press all others together.
 
-    They are ten times as far below the best value of the metric `key` as the median method.
+    They are four times as far below the best value of the metric `key` as the median method.
     """
     values = {m: value for m in results.methods if math.isfinite(value := results.mean(m, key))}
     gaps = {method: max(values.values()) - value for method, value in values.items()}
-    return [method for method, gap in gaps.items() if gap > 10 * np.median(list(gaps.values())) > 0]
+    return [method for method, gap in gaps.items() if gap > 4 * np.median(list(gaps.values())) > 0]
 
 
 def setting(method: str) -> str:
