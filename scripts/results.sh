@@ -58,9 +58,6 @@ if [ "$scale" = small ]; then
     once nlt stress --config demo --out results/trainings_builtin --suites training \
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
     once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
-    once nlt compare --config front --data real_kitchen --scale static --seeds 3 --workers "${WORKERS:-2}" \
-        --out results/static_kitchen --methods cnn cnn@direct feature_projection nlt nlt@radiance \
-        guided_1spp@direct_corrected oidn_1_balanced oidn_1 oidn_4 path_tracing_1
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
@@ -91,7 +88,7 @@ if [ "$scale" = small ]; then
         --methods $table2 cnn@before nlt_photons@before guided_1spp guided_1spp_field photons_only field photon_field
     room --config front --scale any_room --out results/any_room \
         --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
-    once python benchmarks/selection.py
+    once python benchmarks/selection.py --minutes 4
 fi
 for report in results/*/report.html; do  # small enough for git
     case $report in results/table*) megabytes=8 ;; *) megabytes=4 ;; esac
