@@ -23,14 +23,14 @@ from nlt.evaluation.provenance import origin, surroundings
 from nlt.models.factory import read_checkpoint
 from nlt.models.policy import default_device
 from nlt.training import run_lightning
-from nlt.view.drawing import DEMO
+from nlt.view.drawing import PRETRAINED
 
 
 def main(checkpoint: str, commit: str) -> None:
     """Evaluate a checkpoint that was trained at `commit` and write it to where `nlt render --demo` finds it."""
     run_folder = Path(checkpoint).absolute().parents[1]
     name = run_folder.parents[1].name
-    file = Path(next(iter(DEMO.values()))).with_name(f"{name}.safetensors")
+    file = PRETRAINED / f"{name}.safetensors"
     model, _, variant = name.partition("@")
     used = ["data/demo", f"model/{model}", "scale/pretrained", *([f"variant/{variant}"] if variant else [])]
     begun, configs = origin(), [f"--config={config}" for config in used]

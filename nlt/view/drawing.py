@@ -29,11 +29,11 @@ from nlt.scenes.camera import Camera
 from nlt.scenes.description import Experiment, load_description
 from nlt.scenes.state import SceneState
 
-_PRETRAINED = Path(__file__).with_name("pretrained")
+PRETRAINED = Path(__file__).with_name("pretrained")
 # The models that come with nlt, by the name that is shown; the first is the better one.
 DEMO = {
-    "Guided (1 spp), direct": str(_PRETRAINED / "guided_1spp@direct_corrected.safetensors"),
-    "the paper's full model": str(_PRETRAINED / "nlt_photons.safetensors"),
+    "Guided (1 spp), direct": str(PRETRAINED / "guided_1spp@direct_corrected.safetensors"),
+    "the paper's full model": str(PRETRAINED / "nlt_photons.safetensors"),
 }
 DEMO_SCENE = "living_room"
 # What draws a scene in which nothing was trained. No included model is as good there (docs/results.md).
