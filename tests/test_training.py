@@ -20,7 +20,8 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name, read_points, write_shard
 from nlt.metrics.quantities import METRICS
-from nlt.models.module import RenderingModule
+from nlt.models.module import PROJECTION, RenderingModule
+from nlt.models.projection import visible_pixels
 from nlt.training import run_lightning
 
 pytest_plugins = ["training_fixtures"]
@@ -92,6 +93,19 @@ def test_seed(tiny):
         return trainer.callback_metrics["train/loss"].item()
 
     assert losses(0) == losses(0) != losses(1)
+
+
+def test_share_of_seen_photons_is_logged(tiny):
+    """One step whose batch is the whole training set: photons in view over all that arrived."""
+    options = ("--trainer.max_steps=1", f"--data.batch_size={DATASET['train']}")
+    trainer = run_lightning(tiny.command("fit", "nlt_photons", *options)).trainer
+    split = trainer.datamodule.split("train")
+    batch = split.__getitems__(range(len(split)))
+    view = {name: batch[name] for name in PROJECTION}
+    seen = visible_pixels(batch["photon_hit"], batch["photon_valid"], **view) < DATASET["resolution"] ** 2
+    assert 0 < seen.sum() < batch["photon_valid"].sum()
+    expected = seen.sum() / batch["photon_valid"].sum()
+    assert trainer.callback_metrics["train/photons_seen"].item() == pytest.approx(expected.item())
 
 
 def test_two_processes(tiny, tmp_path):

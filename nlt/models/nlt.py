@@ -92,8 +92,13 @@ class NeuralLightTransport(CloudMethod):
         return self.gbuffer_and(batch, clouds, [self._seen_photons(batch)] if delayed else ())
 
     def _seen_photons(self, batch: Batch) -> Tensor:
-        """Return the photons' map (B, photon_width, H, W), computing features only for photons that the view sees."""
+        """Return the photons' map (B, photon_width, H, W), computing features only for photons that the view sees.
+
+        Training logs their share as `train/photons_seen`.
+        """
         images, _, height, width = batch["depth"].shape
         view: dict[str, Any] = {name: batch[name] for name in PROJECTION}
         seen, at = visible_rows(visible_pixels(batch["photon_hit"], batch["photon_valid"], **view), height, width)
+        if self._trainer is not None and self._trainer.training:
+            self.log("train/photons_seen", len(at) / batch["photon_valid"].sum(), batch_size=images)
         return average_rows(self.photon_network(self._photons(batch)[seen]), at, images, height, width)
