@@ -32,7 +32,7 @@ _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wa
 # those of a focal length of at least _FINE pixels. Powers of two spread evenly.
 _PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
 _EMISSION_PLACES = 16
-_SHADOW_RAYS = 16  # of a pixel to each emitter, unless all lamps are flat: then one from each place
+_SHADOW_RAYS = 16  # of a pixel to each emitter; of a fine pixel one from each place if all lamps are flat
 _MOST_MIRRORS = 8  # A ray is followed through at most so many mirrors and panes of glass.
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
@@ -140,9 +140,9 @@ class Renderer:
         """Trace primary rays, and shadow rays if `direct`. They pass through the transparent parts of opacity masks.
 
         Shadow rays start at eight places in each pixel, in images of some 200 pixels or more at four, or at the surface
-        that a mirror or pane shows there. They go to as many fixed points of each lamp, one from each place; to 16 if
-        there is an environment, which gets as many, or a lamp of more than two triangles, of which some face away. So
-        there is no noise, and a penumbra has a few shades.
+        that a mirror or pane shows there. They go to 16 fixed points of each lamp and of the environment, two or four
+        from each place; in such large images one from each place, if all lamps have at most two triangles and none face
+        away. So there is no noise, and a penumbra has a few shades.
 
         Returns:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
@@ -157,8 +157,10 @@ class Renderer:
         fixed["size"] = mi.Vector2f(camera.width, camera.height)
         dr.make_opaque(fixed["size"])
         is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
-        fixed["places"] = _PLACES_FINE if camera.matrix[0, 0] >= _FINE else _PLACES_COARSE
-        fixed["shadow_rays"] = direct * len(self.emitters) * (fixed["places"] if is_flat else _SHADOW_RAYS)
+        is_fine = camera.matrix[0, 0] >= _FINE
+        fixed["places"] = _PLACES_FINE if is_fine else _PLACES_COARSE
+        rays = _PLACES_FINE if is_fine and is_flat else _SHADOW_RAYS
+        fixed["shadow_rays"] = direct * len(self.emitters) * rays
         point, normal, albedo, emission, valid, *light = launch(self._gbuffer[direct], lanes, **fixed)
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
@@ -366,8 +368,8 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
         surface, tint, bounces = _through_mirrors(scene, first, masks)
         emission = _emission(scene, surface)
         is_lamp = (bounces > 0) & dr.any(emission > 0)
-        # Other points of the lamps than the place's number, or places on the left would see only a lamp's left.
-        direct = places * _direct(scene, masks, rays, k ^ (places // 2), places, surface)
+        # Places on one side of the pixel see points on all sides of a lamp, or edges would be lit by one side only.
+        direct = places * _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
         direct = dr.select(is_lamp, emission, direct)
         own = _albedo(first)
         seen = dr.select(bounces > 0, tint * dr.select(is_lamp, 1, _albedo(surface)), 0)

@@ -110,7 +110,7 @@ def surface(camera, buffer):
 
 
 def test_direct_light(tmp_path):
-    """Eight shadow rays, from eight places in a pixel, agree with 256 from each of 9: the mean weighted by albedo.
+    """Sixteen shadow rays, from eight places in a pixel, agree with 256 from each of 9: the mean weighted by albedo.
 
     Within 1 % where all reach the whole lamp, and exactly in the dark; at edges it is closer than what 256 say of the
     pixel's centre.
@@ -142,9 +142,9 @@ def test_direct_light(tmp_path):
     assert np.median(np.abs(ours[whole] / theirs[whole] - 1)) < 0.01
     assert not ours[shadow].any()
     unhindered = theirs[penumbra] / seen[penumbra].mean(1, keepdims=True)
-    assert (np.abs(ours[penumbra] - theirs[penumbra]) < 0.5 * unhindered).all()
+    assert (np.abs(ours[penumbra] - theirs[penumbra]) < 0.17 * unhindered).all()
     error = lambda values: np.sqrt(((values - theirs)[~is_flat] ** 2).mean())
-    assert error(ours) < 0.8 * error(centre)
+    assert error(ours) < 0.4 * error(centre)
 
 
 def test_direct_light_next_to_the_lamp(tmp_path, monkeypatch):
