@@ -63,8 +63,9 @@ class LightTransportDataModule(L.LightningDataModule):
         batch_size: samples per step and process (paper: 32, or 128 for static scenes).
         workers: threads that load samples; with `online`, processes that render them.
         seed: seed of the shuffling; with `online`, of the training samples.
-        online: render training samples during training, use each for one step and store none. An epoch has
+        online: render training samples during training and store none. An epoch has
             `dataset.train` samples per scene. Validation and test samples are still generated and stored.
+        uses: with `online`, steps that use each rendered sample, on average.
         train_images: use only this many training samples of each scene; the number of steps per epoch stays the same.
     """
 
@@ -77,10 +78,13 @@ class LightTransportDataModule(L.LightningDataModule):
         seed: int = 0,
         online: bool = False,
         train_images: int | None = None,
+        uses: int = 1,
     ) -> None:
         super().__init__()
         if online and workers < 1:
             raise UserError(f"data.workers: must be at least 1, is {workers}: with data.online, they render samples")
+        if uses < 1 or (uses > 1 and not online):
+            raise UserError(f"data.uses: must be at least 1, and 1 without data.online, is {uses}")
         if batch_size < 1:
             raise UserError(f"data.batch_size: must be at least 1, is {batch_size}")
         if train_images is not None and (online or not 1 <= train_images <= dataset.train):
@@ -89,7 +93,7 @@ class LightTransportDataModule(L.LightningDataModule):
                 f"is {train_images}"
             )
         self.spec, self.root, self.batch_size, self.workers, self.seed = dataset, root, batch_size, workers, seed
-        self.online, self.passes, self.train_images = online, 0, train_images
+        self.online, self.passes, self.train_images, self.uses = online, 0, train_images, uses
         self.num_scenes = len(dataset.scenes)
         self.stored = dataset.without_train() if online else dataset
         self.gbuffer = False  # whether samples have the whole G-buffer, whatever the method reads
@@ -139,7 +143,7 @@ class LightTransportDataModule(L.LightningDataModule):
 
             devices = self.trainer.num_devices if self.trainer else 1
             threads = max(1, available_cpus() // (self.workers * devices))
-            return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads)
+            return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads, self.uses)
         limit = name == "train" and self.train_images
         spec = dataclasses.replace(self.stored, train=limit) if limit else self.stored
         return LightTransportDataset(self.directory, spec, name, fields)

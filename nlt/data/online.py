@@ -1,5 +1,6 @@
-"""Training samples rendered during training. Each is used for one step only, so no noise is seen twice."""
+"""Training samples rendered during training and never stored."""
 
+from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
@@ -10,6 +11,8 @@ from nlt.data.render import SampleRenderer
 from nlt.data.spec import DatasetSpec
 from nlt.rendering.variant import choose_variant
 
+_REMEMBERED = 512  # samples that a rendering process keeps to show them again
+
 
 class OnlineDataset(LightTransportDataset):
     """An endless sequence of training samples that alternates between the scenes; reading an index renders its sample.
@@ -18,13 +21,23 @@ class OnlineDataset(LightTransportDataset):
 
     Only the fields in `inputs`, or all if it is None, are rendered. The samples avoid the states of the val and test
     samples of `spec`. An epoch has `length` samples, and each rendering process has `threads` threads.
+
+    Only every `uses`-th sample that a process reads is rendered. The others are drawn from the last 512 that it
+    rendered, so that on average each is read `uses` times.
     """
 
     def __init__(
-        self, directory: AnyPath, spec: DatasetSpec, inputs: Iterable[str] | None, length: int, threads: int
+        self,
+        directory: AnyPath,
+        spec: DatasetSpec,
+        inputs: Iterable[str] | None,
+        length: int,
+        threads: int,
+        uses: int = 1,
     ) -> None:
         super().__init__(directory, spec, "train", inputs)
-        self._length, self._threads = length, threads
+        self._length, self._threads, self._uses, self._reads = length, threads, uses, 0
+        self._remembered: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=_REMEMBERED)
         self._renderers: list[SampleRenderer] = []
         choose_variant()  # here, so that all rendering processes inherit it
 
@@ -32,10 +45,14 @@ class OnlineDataset(LightTransportDataset):
         return self._length
 
     def _sample(self, index: int) -> tuple[int, dict[str, np.ndarray]]:
+        self._reads += 1
+        if (self._reads - 1) % self._uses:
+            return self._remembered[np.random.default_rng(index).integers(len(self._remembered))]
         count = len(self.spec.scenes)
         if not self._renderers:  # created in the rendering process
             # Only the last renderer sets the thread count, because loading a scene with one thread deadlocks.
             threads = [*[None] * (count - 1), self._threads]
             self._renderers = [SampleRenderer(self.spec, k, threads[k]) for k in range(count)]
         number, scene = divmod(index, count)
-        return scene, self._renderers[scene].sample("train", number, only=self._stored)
+        self._remembered.append((scene, self._renderers[scene].sample("train", number, only=self._stored)))
+        return self._remembered[-1]

@@ -231,6 +231,7 @@ class DataSection(Settings):
     workers: Any = None
     seed: Any = None
     train_images: Any = None
+    uses: Any = None
 
 
 class _Config(Settings):

@@ -1,4 +1,4 @@
-"""Online training: its samples are those of an endless stored dataset, and each is used once."""
+"""Online training: its samples are those of an endless stored dataset, each used once or a set number of times."""
 
 import json
 
@@ -61,6 +61,22 @@ def test_batches_are_those_of_a_stored_set_without_end(online):
             assert np.array_equal(together[name][k].numpy(), array.astype(together[name].numpy().dtype)), (k, name)
 
 
+def test_uses(online):
+    """With two uses every other sample is one that the process has shown before, of few at first and of many later."""
+    _, spec, directory = online
+    samples = OnlineDataset(directory, spec.without_train(), {"normal"}, 40, 2, uses=2)
+    shown = [samples[index]["noisy"].numpy().tobytes() for index in range(40)]
+    render = SampleRenderer(spec, 0)
+    for k in (0, 38):
+        noisy = torch.from_numpy(render.sample("train", k, only={"noisy"})["noisy"]).float().numpy()
+        assert shown[k] == noisy.tobytes(), "rendered samples are those of the stored set"
+    fresh, again = shown[::2], shown[1::2]
+    assert len(set(fresh)) == 20 and len(set(again)) > 8
+    assert all(image in fresh[: k + 1] for k, image in enumerate(again)) and again != fresh
+    twice = OnlineDataset(directory, spec.without_train(), {"normal"}, 40, 2, uses=2)
+    assert [twice[index]["noisy"].numpy().tobytes() for index in range(6)] == shown[:6]
+
+
 def test_only_what_the_method_reads_is_rendered(online, monkeypatch):
     _, spec, directory = online
     asked = []
@@ -113,6 +129,10 @@ def test_states_of_the_evaluated_splits_are_left_out(tmp_path):
 def test_mistakes(online, tmp_path):
     with pytest.raises(UserError, match=r"data.workers: must be at least 1, is 0: with data.online"):
         module_of(online, workers=0)
+    with pytest.raises(UserError, match=r"data.uses: must be at least 1, and 1 without data.online, is 0"):
+        module_of(online, uses=0)
+    with pytest.raises(UserError, match=r"data.uses: must be at least 1, and 1 without data.online, is 2"):
+        LightTransportDataModule(online[1], uses=2)
     odd = write(tmp_path / "odd.yaml", {"data": {"dataset": DATASET, "online": "yes please"}})
     with pytest.raises(UserError, match=r"odd.yaml: data.online: must be true or false"):
         load_spec([str(odd)])
