@@ -143,7 +143,8 @@ class LightTransportDataModule(L.LightningDataModule):
 
             devices = self.trainer.num_devices if self.trainer else 1
             threads = max(1, available_cpus() // (self.workers * devices))
-            return OnlineDataset(self.directory, self.stored, fields, self.num_scenes * self.spec.train, threads, self.uses)
+            length = self.num_scenes * self.spec.train
+            return OnlineDataset(self.directory, self.stored, fields, length, threads, self.uses)
         limit = name == "train" and self.train_images
         spec = dataclasses.replace(self.stored, train=limit) if limit else self.stored
         return LightTransportDataset(self.directory, spec, name, fields)
