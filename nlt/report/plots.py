@@ -80,7 +80,9 @@ def add_legend(
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
     """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
     broken = (name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(") for name in columns)
-    titles = ["\n".join(textwrap.fill(line, _TITLE) for line in title.split("\n")) for title in broken]
+    titles = [
+        "\n".join(textwrap.fill(line.replace("_", " "), _TITLE) for line in title.split("\n")) for title in broken
+    ]
     top = _LINE * (2 + max(title.count("\n") for title in titles))
     size = (_INCH * len(columns), _INCH * rows + top + bottom)
     figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
