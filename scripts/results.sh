@@ -20,11 +20,10 @@ fixed_lights() {
 }
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
-front="cnn feature_projection nlt nlt_photons guided_1spp guided_1spp_relative
-    oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then
-    room --config table2_real_demodulated --methods $table2 --out results/real_living_room
+    room --config table2_real_demodulated --seeds 2 --out results/real_living_room \
+        --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
     room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
     once python benchmarks/error_spectra.py results/real_living_room_256
     room --config table2_real --scale medium --out results/real_living_room_256_radiance \
@@ -33,7 +32,6 @@ if [ "$scale" = small ]; then
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
-    room --config front --methods $front --out results/front_living_room
     room --config front --scale medium --out results/front_living_room_256 \
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
