@@ -37,7 +37,7 @@ class OnlineDataset(LightTransportDataset):
     ) -> None:
         super().__init__(directory, spec, "train", inputs)
         self._length, self._threads, self._uses, self._reads = length, threads, uses, 0
-        self._remembered: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=_REMEMBERED)
+        self._remembered: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=_REMEMBERED if uses > 1 else 1)
         self._renderers: list[SampleRenderer] = []
         choose_variant()  # here, so that all rendering processes inherit it
 
