@@ -14,10 +14,10 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from nlt.config import merge, read_configs
 from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.generate import generate
-from nlt.data.spec import DatasetSpec, load_spec
+from nlt.data.spec import load_spec
 from nlt.data.store import ShardReader
 from nlt.errors import UserError
 from nlt.evaluation.comparison import build_if_untrained
@@ -73,15 +73,17 @@ def table(records: list[dict[str, Any]], lines: dict[str, float]) -> str:
     return "\n".join([*text, *grid(headings, map(cells_of, records), numbers=False)])
 
 
-def run(config: dict[str, Any], spec: DatasetSpec, seed: int) -> dict[str, Any]:
-    """Render the training set, train, and return the minutes of both and the trained method.
+def run(config: dict[str, Any], room: list[str], seed: int) -> dict[str, Any]:
+    """Render the training set of `room`, arguments of `nlt generate`; train; return both times and the trained method.
 
     With data.online, training images are rendered while the method trains, and the first step renders points alone.
     """
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
-        stored = spec.without_train() if config["data"].get("online") else spec
-        generate(replace(stored, val=0, test=0), folder)
+        # A process of its own, because each worker imports the main module again, and this one imports Lightning.
+        own_room = ["data.dataset.val=0", "data.dataset.test=0", f"data.root={folder}"]
+        if failed := subprocess.run([sys.executable, "-m", "nlt.cli", "generate", *room, *own_room]).returncode:
+            sys.exit(failed)  # it has said why
         rendered = time.perf_counter()
         own = {"data": {"root": folder, "dataset": {"val": 0, "test": 0}}, "trainer": {"limit_val_batches": 0}}
         fit(Path(folder) / "run", merge(config, own), seed)
@@ -129,7 +131,8 @@ def main() -> None:
     known = json.loads(lines_file.read_text())
     if known["first_pixel"] != first_pixel or known["views"] != tests.test:
         raise UserError(f"--set: changes the test views, so {lines_file} does not apply; leave them as they are")
-    result = run(read_configs([data, model, scale, variant], settings), spec, options.seed)
+    room = [f"--config={data}", f"--config={scale}", *options.set]
+    result = run(read_configs([data, model, scale, variant], settings), room, options.seed)
     metrics = judge.evaluate(result.pop("method"))[0]
     provenance = origin()
     record = {

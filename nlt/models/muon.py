@@ -1,6 +1,6 @@
 """Muon (Jordan et al. 2024): steps of a matrix are orthogonalised, so that all its directions learn equally fast."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,22 +11,26 @@ _ITERATIONS = 5
 _ADAMS_STEP = 0.2  # root mean square of Adam's steps over its learning rate, as Liu et al. (2025) measured
 
 
-def orthogonalize(matrix: Tensor) -> Tensor:
-    """Return approximately U V' of the matrix U S V' (n, m): singular values become about 0.7 to 1.2.
+def orthogonalize(matrices: Sequence[Tensor]) -> list[Tensor]:
+    """Return approximately U V' of each matrix U S V' (n, m): singular values become about 0.7 to 1.2.
 
     The coefficients of this Newton-Schulz iteration are Jordan's: they raise small singular values fastest.
     """
-    x = matrix / (matrix.norm() + 1e-7)
-    if x.shape[0] > x.shape[1]:
-        return orthogonalize(x.T).T
-    # Each iteration multiplies x by a polynomial of x x', so the product of these small (n, n) factors is enough.
-    product = identity = torch.eye(len(x), dtype=x.dtype, device=x.device)
-    square = x @ x.T
-    for _ in range(_ITERATIONS):
-        factor = 3.4445 * identity + (2.0315 * square @ square - 4.775 * square)
-        product = factor @ product
-        square = factor @ square @ factor
-    return product @ x
+    wide = [x if x.shape[0] <= x.shape[1] else x.T for x in matrices]
+    wide = [x / (x.norm() + 1e-7) for x in wide]
+    # Each iteration multiplies x by a polynomial of x x', so the product of these small (n, n) factors is enough. It is
+    # computed for all matrices of the same n at once, because a product of so small matrices costs little but its call.
+    factors = {}
+    for n in {len(x) for x in wide}:
+        square = torch.stack([x @ x.T for x in wide if len(x) == n])
+        product = identity = torch.eye(n, dtype=square.dtype, device=square.device)
+        for _ in range(_ITERATIONS):
+            factor = 3.4445 * identity + (2.0315 * square @ square - 4.775 * square)
+            product = factor @ product
+            square = factor @ square @ factor
+        factors[n] = iter(product)
+    wide = [next(factors[len(x)]) @ x for x in wide]
+    return [x if x.shape == matrix.shape else x.T for x, matrix in zip(wide, matrices, strict=True)]
 
 
 class Muon(torch.optim.Adam):
@@ -42,16 +46,17 @@ class Muon(torch.optim.Adam):
         with torch.enable_grad():
             loss = closure() if closure else None
         for group in self.param_groups:
-            for weight in group["params"] if group.get("orthogonal") else ():
-                if weight.grad is None:
-                    continue
+            weights = [weight for weight in group["params"] if weight.grad is not None and group.get("orthogonal")]
+            directions = []
+            for weight in weights:
                 # Adam asks every state for its step when it is loaded.
                 state = self.state[weight] or {"step": torch.zeros(()), "momentum": torch.zeros_like(weight)}
                 self.state[weight] = state
                 momentum = state["momentum"].lerp_(weight.grad, 1 - _MOMENTUM)
-                rows = weight.grad.lerp(momentum, _MOMENTUM).flatten(1)
-                size = _ADAMS_STEP * max(rows.shape) ** 0.5
-                weight.sub_(orthogonalize(rows).view(weight.shape), alpha=group["lr"] * size)
+                directions.append(weight.grad.lerp(momentum, _MOMENTUM).flatten(1))
                 weight.grad = None  # so that Adam leaves it alone
+            for weight, direction in zip(weights, orthogonalize(directions), strict=True):
+                size = _ADAMS_STEP * max(direction.shape) ** 0.5
+                weight.sub_(direction.view(weight.shape), alpha=group["lr"] * size)
         super().step()
         return loss
