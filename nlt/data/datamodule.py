@@ -61,7 +61,8 @@ class LightTransportDataModule(L.LightningDataModule):
         dataset: the dataset's spec; `nlt generate` renders the dataset.
         root: directory or fsspec URL of datasets.
         batch_size: samples per step and process (paper: 32, or 128 for static scenes).
-        workers: threads that load samples; with `online`, processes that render them.
+        workers: threads that load samples; with `online`, processes that render them, on half of the CPUs if the
+            method trains on the other half.
         seed: seed of the shuffling; with `online`, of the training samples.
         online: render training samples during training and store none. An epoch has
             `dataset.train` samples per scene. Validation and test samples are still generated and stored.
@@ -131,6 +132,14 @@ class LightTransportDataModule(L.LightningDataModule):
             self.directory = directory
             self.points = [read_points(directory / points_name(k)) for k in range(self.num_scenes)]
 
+    def _rendering_cpus(self) -> int:
+        """Return how many CPUs render online: all, or a half if the method trains on the others.
+
+        Threads that wait for a CPU slow down all others, so the two must not share one.
+        """
+        cpus = available_cpus()
+        return max(1, cpus // 2) if self.trainer and self.trainer.strategy.root_device.type == "cpu" else cpus
+
     def split(self, name: str) -> LightTransportDataset:
         """Return the dataset of a split with the fields that the trainer's method needs, or all without a trainer."""
         assert self.directory is not None, "call setup first"
@@ -142,7 +151,7 @@ class LightTransportDataModule(L.LightningDataModule):
             from nlt.data.online import OnlineDataset  # here, because it needs Mitsuba
 
             devices = self.trainer.num_devices if self.trainer else 1
-            threads = max(1, available_cpus() // (self.workers * devices))
+            threads = max(1, self._rendering_cpus() // (self.workers * devices))
             length = self.num_scenes * self.spec.train
             return OnlineDataset(self.directory, self.stored, fields, length, threads, self.uses)
         limit = name == "train" and self.train_images
@@ -161,6 +170,8 @@ class LightTransportDataModule(L.LightningDataModule):
         sampler: Sampler[int] = EpochSampler(length, rank, processes, training, self.seed, len(dataset))
         if online:
             sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
+            if rest := available_cpus() - self._rendering_cpus():
+                torch.set_num_threads(min(torch.get_num_threads(), rest))
         # Mitsuba needs processes of its own, spawned because a fork would lose its threads. They may live long because
         # the memory of a single scene's renderer does not grow.
         kind = partial(DataLoader, multiprocessing_context="spawn", persistent_workers=True) if online else ThreadLoader

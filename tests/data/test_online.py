@@ -1,6 +1,7 @@
 """Online training: its samples are those of an endless stored dataset, each used once or a set number of times."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -75,6 +76,22 @@ def test_uses(online):
     assert all(image in fresh[: k + 1] for k, image in enumerate(again)) and again != fresh
     twice = OnlineDataset(directory, spec.without_train(), {"normal"}, 40, 2, uses=2)
     assert [twice[index]["noisy"].numpy().tobytes() for index in range(6)] == shown[:6]
+
+
+@pytest.mark.parametrize(
+    ("device", "workers", "rendering", "training"), [("cpu", 1, 3, 3), ("cpu", 2, 1, 3), ("cuda", 1, 6, 6)]
+)
+def test_training_and_rendering_share_no_cpu(online, monkeypatch, device, workers, rendering, training):
+    monkeypatch.setattr("nlt.data.datamodule.available_cpus", lambda: 6)
+    module, before = module_of(online, workers=workers), torch.get_num_threads()
+    root = SimpleNamespace(root_device=torch.device(device))
+    module.trainer = SimpleNamespace(num_devices=1, global_rank=0, world_size=1, strategy=root)
+    torch.set_num_threads(6)
+    try:
+        assert module.train_dataloader().dataset._threads == rendering
+        assert torch.get_num_threads() == training
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_only_what_the_method_reads_is_rendered(online, monkeypatch):
