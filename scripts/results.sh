@@ -24,10 +24,10 @@ table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64
 if [ "$scale" = small ]; then
     room --config table2_real_demodulated --seeds 2 --out results/real_living_room \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
-    room --config table2_real_demodulated --scale medium --methods guided_1spp $table2 --out results/real_living_room_256
+    room --config table2_real_demodulated --scale medium --out results/real_living_room_256 \
+        --methods $table2 cnn@direct guided_1spp guided_1spp@direct
     once python benchmarks/error_spectra.py results/real_living_room_256
-    room --config table2_real --scale medium --out results/real_living_room_256_radiance \
-        --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
+    room --config table2_real --scale medium --methods $table2 --out results/real_living_room_256_radiance
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
