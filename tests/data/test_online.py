@@ -79,13 +79,15 @@ def test_uses(online):
 
 
 @pytest.mark.parametrize(
-    ("device", "workers", "rendering", "training"), [("cpu", 1, 3, 3), ("cpu", 2, 1, 3), ("cuda", 1, 6, 6)]
+    ("device", "devices", "workers", "rendering", "training"),
+    [("cpu", 1, 1, 3, 3), ("cpu", 1, 2, 1, 3), ("cpu", 3, 1, 1, 1), ("cuda", 1, 1, 6, 6)],
 )
-def test_training_and_rendering_share_no_cpu(online, monkeypatch, device, workers, rendering, training):
+def test_training_and_rendering_share_no_cpu(online, monkeypatch, device, devices, workers, rendering, training):
     monkeypatch.setattr("nlt.data.datamodule.available_cpus", lambda: 6)
     module, before = module_of(online, workers=workers), torch.get_num_threads()
     root = SimpleNamespace(root_device=torch.device(device))
-    module.trainer = SimpleNamespace(num_devices=1, global_rank=0, world_size=1, strategy=root)
+    module.batch_size = 1
+    module.trainer = SimpleNamespace(num_devices=devices, global_rank=0, world_size=devices, strategy=root)
     torch.set_num_threads(6)
     try:
         assert module.train_dataloader().dataset._threads == rendering
