@@ -74,9 +74,10 @@ def table(records: list[dict[str, Any]], lines: dict[str, float]) -> str:
 
 
 def run(config: dict[str, Any], room: list[str], seed: int) -> dict[str, Any]:
-    """Render the training set of `room`, arguments of `nlt generate`; train; return both times and the trained method.
+    """Render the training set, train, and return the minutes of both and the trained method.
 
-    With data.online, training images are rendered while the method trains, and the first step renders points alone.
+    `room` are the arguments of `nlt generate` that describe the training set. With data.online, its images are rendered
+    while the method trains, and the first step renders points alone.
     """
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()

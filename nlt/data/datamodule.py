@@ -170,9 +170,8 @@ class LightTransportDataModule(L.LightningDataModule):
         sampler: Sampler[int] = EpochSampler(length, rank, processes, training, self.seed, len(dataset))
         if online:
             sampler = OnlineSampler(len(dataset), rank, processes, self.seed, self.next_pass)
-            if rest := available_cpus() - self._rendering_cpus():
-                devices = self.trainer.num_devices if self.trainer else 1
-                torch.set_num_threads(min(torch.get_num_threads(), max(1, rest // devices)))
+            if self.trainer and (rest := available_cpus() - self._rendering_cpus()):
+                torch.set_num_threads(min(torch.get_num_threads(), max(1, rest // self.trainer.num_devices)))
         # Mitsuba needs processes of its own, spawned because a fork would lose its threads. They may live long because
         # the memory of a single scene's renderer does not grow.
         kind = partial(DataLoader, multiprocessing_context="spawn", persistent_workers=True) if online else ThreadLoader
