@@ -33,7 +33,7 @@ def computing(device: torch.device, seconds: float) -> dict[str, float]:
             _peak_rate(partial(_convolution, device, dtype, layout), BATCHES, share / 2)
             for layout in (torch.contiguous_format, torch.channels_last)
         )
-    source = torch.zeros(_COPIED // 4, device=device)
+    source = torch.randn(_COPIED // 4, device=device)
     target = torch.empty_like(source)
     ceilings["copy"] = 2 * _COPIED / best(lambda: target.copy_(source), share)
     return ceilings
@@ -74,14 +74,14 @@ def _peak_rate(
 
 
 def _matmul(device: torch.device, dtype: torch.dtype, size: int) -> tuple[Callable[[], object], float]:
-    a = torch.ones(size, size, device=device, dtype=dtype)
+    a = torch.randn(size, size, device=device, dtype=dtype)
     return lambda: a @ a, 2.0 * size**3
 
 
 def _convolution(
     device: torch.device, dtype: torch.dtype, layout: torch.memory_format, batch: int
 ) -> tuple[Callable[[], object], float]:
-    image = torch.ones(batch, _CHANNELS, _SIDE, _SIDE, device=device, dtype=dtype).to(memory_format=layout)
-    kernel = torch.ones(_CHANNELS, _CHANNELS, 3, 3, device=device, dtype=dtype).to(memory_format=layout)
+    image = torch.randn(batch, _CHANNELS, _SIDE, _SIDE, device=device, dtype=dtype).to(memory_format=layout)
+    kernel = torch.randn(_CHANNELS, _CHANNELS, 3, 3, device=device, dtype=dtype).to(memory_format=layout)
     operations = 2.0 * math.prod(kernel.shape) * batch * _SIDE**2
     return lambda: F.conv2d(image, kernel, padding=1), operations
