@@ -12,7 +12,13 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from nlt.data.dataset import EpochSampler, LightTransportDataset, OnlineSampler, identity_collate
+from nlt.data.dataset import (
+    EpochSampler,
+    LightTransportDataset,
+    OnlineSampler,
+    contiguous_collate,
+    identity_collate,
+)
 from nlt.data.engines import available_cpus
 from nlt.data.files import AnyPath
 from nlt.data.sample import BUFFERS
@@ -174,15 +180,16 @@ class LightTransportDataModule(L.LightningDataModule):
                 torch.set_num_threads(min(torch.get_num_threads(), max(1, rest // self.trainer.num_devices)))
         # Mitsuba needs processes of its own, spawned because a fork would lose its threads. They may live long because
         # the memory of a single scene's renderer does not grow.
+        pinned = torch.cuda.is_available()
         kind = partial(DataLoader, multiprocessing_context="spawn", persistent_workers=True) if online else ThreadLoader
         return kind(
             dataset,
             batch_size=self.batch_size,
             sampler=sampler,
             drop_last=training,
-            collate_fn=identity_collate,
+            collate_fn=contiguous_collate if pinned else identity_collate,
             num_workers=self.workers,
-            pin_memory=torch.cuda.is_available(),
+            pin_memory=pinned,
         )
 
     def train_dataloader(self) -> DataLoader:

@@ -115,6 +115,11 @@ def identity_collate(batch: Any) -> Any:
     return batch
 
 
+def contiguous_collate(batch: Any) -> Any:
+    """Return the batch with memory of its own for every tensor, without which a tensor cannot be pinned."""
+    return {name: tensor.contiguous() for name, tensor in batch.items()}
+
+
 def stack(tensors: list[Tensor]) -> Tensor:
     """Stack tensors, float16 as float32. A tensor shared by all samples, such as a scene's points, is not copied."""
     dtype = tensors[0].dtype

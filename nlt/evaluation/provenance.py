@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from nlt.evaluation.clock import FRAMES, WARM_UP
 from nlt.metrics.inception import find_weights
 from nlt.models.policy import Policy
 from nlt.paths import PROJECT
@@ -41,6 +40,8 @@ def origin() -> dict[str, Any]:
 
 def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str, Any]:
     """Return what else determines a result: device, versions, clock settings, policy."""
+    from nlt.evaluation.clock import FRAMES, WARM_UP  # here, because it imports Mitsuba (see `trainings.train`)
+
     variant, weights = choose_variant(), find_weights()
     return {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),

@@ -20,7 +20,6 @@ import yaml
 from nlt.config import merge
 from nlt.data import engines
 from nlt.data.files import AnyPath, write_bytes
-from nlt.data.generate import generate
 from nlt.errors import DivergedError, UserError, to_user_error
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.progress import DONE, Progress, ProgressTable, images_seen
@@ -106,6 +105,8 @@ def generate_datasets(
     comparison: Comparison, workers: int | None = None, scheduler: str = "local", slurm: Mapping[str, str] | None = None
 ) -> AnyPath:
     """Render what is missing of the compared dataset and of those that its methods train on; return the former."""
+    from nlt.data.generate import generate  # here, because it imports Mitsuba
+
     specs = [comparison.spec]
     for spec in comparison.training_specs.values():
         if spec not in specs:
@@ -122,7 +123,8 @@ def train(
     Those that start from another training's weights run after all others.
 
     Each has its own process, because it may be killed for its memory and because Lightning keeps global state. On
-    this machine they are forked from a process that has imported Lightning, which takes seconds. On its processor,
+    this machine they are forked from a process that has imported Lightning, which takes seconds, but not Mitsuba: its
+    import initialises CUDA, which a forked process cannot use. On its processor,
     several trainings run side by side and share the cores, which is faster than all cores for one after the other;
     there are never more than cores, because threads that wait for a core slow down all others.
 

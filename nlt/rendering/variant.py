@@ -10,9 +10,6 @@ import subprocess
 import sys
 from typing import NamedTuple
 
-import drjit as dr
-import mitsuba as mi
-
 from nlt.errors import UserError
 
 log = logging.getLogger(__name__)
@@ -37,6 +34,9 @@ class Variant(NamedTuple):
 @functools.cache
 def use_variant() -> Variant:
     """Choose, activate and log a Mitsuba variant. `NLT_VARIANT` names a variant to use without probing."""
+    import drjit as dr  # here, because importing Dr.Jit initialises CUDA, and then a process can no longer be forked
+    import mitsuba as mi
+
     variant = choose_variant()
     mi.set_variant(variant.name)
     dr.set_thread_count(max(2, dr.thread_count()))  # with one thread on one core, loading some scenes hangs

@@ -293,6 +293,25 @@ def test_threads_read_the_same_batches_in_the_same_order(dataset):
         assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
+def test_batches_for_a_gpu_can_be_pinned(dataset, monkeypatch):
+    """PyTorch copies a tensor into pinned memory in place, which fails if its elements share memory."""
+    pinned = []
+
+    def pin(tensor):
+        shares_memory = any(n > 1 and stride == 0 for n, stride in zip(tensor.shape, tensor.stride(), strict=True))
+        pinned.append(shares_memory)
+        return tensor
+
+    module = LightTransportDataModule(spec_of(), str(dataset.parent), batch_size=2, workers=2)
+    module.setup("fit")
+    (alone, *_) = module.train_dataloader()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
+    (batch, *_) = module.train_dataloader()
+    assert len(pinned) >= len(batch) and not any(pinned)
+    assert all(torch.equal(batch[name], alone[name]) for name in alone)
+
+
 def test_threads_end_with_the_reading(dataset):
     module = LightTransportDataModule(spec_of(), str(dataset.parent), batch_size=1, workers=2)
     module.setup("fit")

@@ -346,6 +346,12 @@ def test_manifest(world):
 # ---- run again ------------------------------------------------------------------------------------------
 
 
+def test_trainings_are_forked_from_a_process_without_mitsuba():
+    """Importing Dr.Jit initialises CUDA, and then PyTorch cannot use CUDA in a forked process."""
+    program = "import sys, nlt.evaluation.trainings; print({'drjit', 'mitsuba'} & sys.modules.keys())"
+    assert subprocess.check_output([sys.executable, "-c", program], text=True) == "set()\n"
+
+
 def test_nothing_is_trained_twice(world, trainings):
     again = world.compare("--methods", "cnn", "nlt_photons", "denoising_1_4")
     assert trainings == []
