@@ -32,6 +32,12 @@ if [ "$scale" = small ]; then
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
+    room --config windows --scale pretrained --out results/windows_128 \
+        --methods cnn cnn@windows_128 photons_only photons_only@windows_128
+    once nlt compare --config front --data demo --scale medium --seeds 3 --workers "${WORKERS:-2}" \
+        --out results/front_builtin_256 \
+        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_thin \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --out results/front_living_room_256 \
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \

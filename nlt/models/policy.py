@@ -42,12 +42,12 @@ class Policy:
     scaled; in training, weights and Adam's state stay float32, and so do positions, projection, loss and metrics.
 
     `sparse`: with many pixels per point, projected features stay a list of rows, which the first convolution adds up.
-    Not tested on a GPU.
+    Used on a CPU only.
 
     `int8`: the large 3x3 convolutions of the U-Net's blocks run in 8-bit integers, the layers around them in bfloat16.
 
-    The convolutions' layout is channels_last either way. torch.compile and CUDA graphs are not used: they were not
-    tested on a GPU, and a machine without one may have no compiler.
+    The convolutions' layout is channels_last either way. torch.compile is not used, because it is slower on a CPU, and
+    a machine may have no compiler; neither are CUDA graphs, which would save half a millisecond of a frame.
     """
 
     bfloat16: bool = False
