@@ -36,7 +36,7 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@windows_128 photons_only photons_only@windows_128
     once nlt compare --config front --data demo --scale medium --seeds 3 --workers "${WORKERS:-2}" \
         --out results/front_builtin_256 \
-        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_thin \
+        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --out results/front_living_room_256 \
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
@@ -44,7 +44,7 @@ if [ "$scale" = small ]; then
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --seeds 3 --out results/front_256 \
         --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        guided_1spp_1_16@direct_narrow oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected guided_1_1@direct \
         guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
