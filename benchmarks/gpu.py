@@ -111,6 +111,8 @@ def main() -> None:
     parser.add_argument("--compile", action="store_true", help="also measure torch.compile")
     parser.add_argument("--out", type=Path, default=Path("results/bench/gpu/unet.json"))
     options = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("this machine has no CUDA device; benchmarks/bench.py measures a processor")
     report = {"manifest": origin() | surroundings(torch.device("cuda")), "turns": options.turns}
     torch.backends.cudnn.allow_tf32 = True
     with torch.inference_mode():

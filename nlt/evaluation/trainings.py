@@ -124,9 +124,9 @@ def train(
 
     Each has its own process, because it may be killed for its memory and because Lightning keeps global state. On
     this machine they are forked from a process that has imported Lightning, which takes seconds, but not Mitsuba: its
-    import initialises CUDA, which a forked process cannot use. On its processor,
-    several trainings run side by side and share the cores, which is faster than all cores for one after the other;
-    there are never more than cores, because threads that wait for a core slow down all others.
+    import initialises CUDA, which a forked process cannot use. On its processor, several trainings run side by side and
+    share the cores, which is faster than all cores for one after the other; there are never more than cores, because
+    threads that wait for a core slow down all others.
 
     Raises:
         UserError: a config or the dataset is wrong, or the disk is full.
