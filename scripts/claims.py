@@ -56,8 +56,10 @@ def _heading(folder: Path) -> str:
     manifest, config = _manifest(folder), _config(folder)
     size, seeds = config["data"]["dataset"]["resolution"], len(manifest["seeds"])
     scene, output = ", ".join(manifest["scenes"]).replace("_", " "), manifest["variant"] or "radiance"
-    steps = f"{config['trainer']['max_steps']:,} steps" + (f" x {seeds}" if seeds > 1 else "")
-    return f"[{scene}, {size}x{size}, {output}, {steps}](../results/{folder.name}/claims.md)"
+    images = config["trainer"]["max_steps"] * config["data"]["batch_size"]
+    seen = f"{images:,} images" + (f" x {seeds}" if seeds > 1 else "")
+    width = f"width {config['model']['init_args']['width']}"
+    return f"[{scene}, {size}x{size}, {width}, {output}, {seen}](../results/{folder.name}/claims.md)"
 
 
 if __name__ == "__main__":

@@ -67,6 +67,13 @@ if [ "$scale" = small ]; then
     room --config table2_real --out results/real_living_room_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
 fi
+if [ "$scale" = gpu ]; then
+    room --config table2_real --scale gpu_256 --workers 9 --out results/real_living_room_256_gpu \
+        --methods denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt \
+        nlt_photons path_tracing_1 path_tracing_4
+    room --config table2_real_demodulated --scale gpu_256 --workers 2 --out results/real_living_room_256_gpu_direct \
+        --methods guided_1spp@direct cnn@direct
+fi
 if [ "$scale" != small ]; then
     for comparison in table2_real table1_real ablation_real static_kitchen_real static_bathroom_real; do
         publish --config "$comparison"
