@@ -1,7 +1,7 @@
 """The views of the stress suites as batches, and the evaluation of methods on them."""
 
-import copy
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -150,8 +150,8 @@ class SuiteViews:
                 for draw in (view_set for view_set in mine if view_set.ladder == DRAWS):
                     if kind == "points":
                         before, after = (read_points(self.directory / s.points_name) for s in (clean_set, draw))
-                        moved = _with_nearest_embeddings(method, scene, before, after)
-                        predictions.append(self.predict(moved, self._batch(clean_set, after)))
+                        with nearest_embeddings(method, scene, before, after):
+                            predictions.append(self.predict(method, self._batch(clean_set, after)))
                     else:
                         prefix = {"photons": "photon_", "noise": "noisy"}[kind]
                         drawn = {name: value for name, value in self.batch(draw).items() if name.startswith(prefix)}
@@ -178,21 +178,29 @@ def _blended(radiance: Tensor, frames: Batch) -> Tensor:
     return torch.cat([steady(radiance[k : k + 1], frame) for k, frame in enumerate(each)])
 
 
-def _with_nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Method:
-    """Return a copy in which a scene's points have the embedding of the nearest former point of the same object."""
-    method = copy.deepcopy(method)
-    for module in method.modules():
-        if isinstance(module, PointEmbedding):
-            count = module.num_points
-            # The objects are so far apart that the nearest point is of the same object.
-            before_at, after_at = (
-                np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
-            )
-            distance, nearest = cKDTree(before_at).query(after_at)
-            nearest = np.where(distance < 1e6, nearest, np.arange(count))  # objects without former points keep rows
-            rows = module.table.weight.data[scene * count : (scene + 1) * count]
-            rows[:] = rows[torch.from_numpy(nearest).to(rows.device)]
-    return method
+@contextmanager
+def nearest_embeddings(method: Method, scene: int, before: Points, after: Points) -> Iterator[None]:
+    """Give a scene's points the embedding of the nearest former point of the same object, within the context.
+
+    The method itself is changed, because a method with 8-bit weights cannot be copied.
+    """
+    embeddings = [module for module in method.modules() if isinstance(module, PointEmbedding)]
+    own = [embedding.table.weight.data.clone() for embedding in embeddings]
+    for embedding in embeddings:
+        count = embedding.num_points
+        # The objects are so far apart that the nearest point is of the same object.
+        before_at, after_at = (
+            np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
+        )
+        distance, nearest = cKDTree(before_at).query(after_at)
+        nearest = np.where(distance < 1e6, nearest, np.arange(count))  # objects without former points keep rows
+        rows = embedding.table.weight.data[scene * count : (scene + 1) * count]
+        rows[:] = rows[torch.from_numpy(nearest).to(rows.device)]
+    try:
+        yield
+    finally:
+        for embedding, weight in zip(embeddings, own, strict=True):
+            embedding.table.weight.data.copy_(weight)
 
 
 def relative_error(prediction: Tensor, a: Tensor, b: Tensor, exposure: Tensor) -> Tensor:

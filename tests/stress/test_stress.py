@@ -16,6 +16,7 @@ from generated import spec_of
 from made_results import make_results, papers_numbers
 from safetensors import safe_open
 from synthetic import PHOTONS, POINTS, synthetic_batch
+from torch import nn
 
 from nlt.cli import main
 from nlt.config import merge
@@ -25,6 +26,7 @@ from nlt.evaluation.paper import label
 from nlt.evaluation.results import read_rows, write_manifest, write_rows
 from nlt.models.module import PROJECTION
 from nlt.models.projection import visible_pixels
+from nlt.models.transport import PointEmbedding
 from nlt.paths import CONFIGS
 from nlt.report.page import write_page
 from nlt.stress.changed_scene import MESHES, ChangedScene
@@ -33,6 +35,7 @@ from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
 from nlt.stress.report import breaking_point, stress_section
 from nlt.stress.suites import FLICKER, PATHS, ROWS, STEADY, load_suites
+from nlt.stress.views import nearest_embeddings
 
 pytestmark = pytest.mark.slow
 
@@ -379,6 +382,32 @@ def test_blended_frames_of_a_path(stressed):
         assert 0 < steady["value"] < alone["value"], path
         assert path == "camera" or 0 < steady["error"] < alone["error"], path
     assert "Steady frames" in (stressed.directory / "stress.md").read_text()
+
+
+@pytest.mark.parametrize("scene", [0, 1])
+def test_new_points_take_the_nearest_embedding(scene):
+    """Of the same object, by brute force in float64; points of a new object, and the other scene, keep theirs."""
+
+    class Uncopyable(nn.Module):  # as 8-bit weights are
+        def __deepcopy__(self, memo: object) -> None:
+            raise NotImplementedError
+
+    count = 40
+    rng = np.random.default_rng(0)
+    before, after = ({"position": rng.normal(size=(count, 3)), "object": rng.integers(0, 3, count)} for _ in range(2))
+    after["object"][5:9] = 7
+    method = nn.Sequential(PointEmbedding(2, count, 4), Uncopyable())
+    own = method[0].table.weight.detach().clone()
+    expected = own.clone()
+    for k in range(count):
+        same = np.flatnonzero(before["object"] == after["object"][k])
+        if len(same):
+            distance = np.linalg.norm(before["position"][same] - after["position"][k], axis=1)
+            expected[scene * count + k] = own[scene * count + same[distance.argmin()]]
+    assert not torch.equal(expected, own) and torch.equal(expected[scene * count + 5], own[scene * count + 5])
+    with torch.inference_mode(), nearest_embeddings(method, scene, before, after):
+        assert torch.equal(method[0].table.weight, expected)
+    assert torch.equal(method[0].table.weight, own)
 
 
 def test_an_unknown_change(stressed, tmp_path, capsys):
