@@ -33,7 +33,9 @@ _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wa
 _PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
 _EMISSION_PLACES = 16
 _SHADOW_RAYS = 16  # of a pixel to each emitter; of a fine pixel one from each place if all lamps are flat
-_MOST_MIRRORS = 8  # A ray is followed through at most so many mirrors and panes of glass.
+# A ray is followed from a mirror, and through a thin pane or both sides of a thick one. Through more, as in a wine glass,
+# one of the few rays in a pixel may find a lamp that almost no path finds, and the pixel becomes a bright dot.
+_MOST_MIRRORS = 2
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
@@ -140,7 +142,7 @@ class Renderer:
         """Trace primary rays, and shadow rays if `direct`. They pass through the transparent parts of opacity masks.
 
         Shadow rays start at eight places in each pixel, in images of some 200 pixels or more at four, or at the surface
-        that a mirror or pane shows there. They go to 16 fixed points of each lamp and of the environment, two or four
+        that a mirror or pane shows there; only two of these are followed. They go to 16 fixed points of each lamp and of the environment, two or four
         from each place; in such large images one from each place, if all lamps have at most two triangles and none face
         away. So there is no noise, and a penumbra has a few shades.
 

@@ -227,6 +227,21 @@ def test_direct_light_by_way_of(tmp_path, case):
     np.testing.assert_allclose(ours["direct"][:, lamp], np.array([LIGHT["radiance"]]).T.repeat(lamp.sum(), 1))
 
 
+@pytest.mark.parametrize("panes", [2, 3])
+def test_at_most_two_panes_are_looked_through(tmp_path, panes):
+    """A lamp by way of more surfaces would be a dot as bright as the lamp, which almost no path sees."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    source = tmp_path / "scene.xml"
+    glass = "".join(PANE.format(x=-0.8 + 0.05 * k, bsdf=GLASS).replace("</scene>", "") for k in range(panes))
+    source.write_text(source.read_text().replace("</scene>", glass + "</scene>"))
+    up, target = np.array([0, 1.0, 0]), np.array([1.0, 0.9, -0.3])
+    camera = Camera.look_at(np.array([-0.9, 0.6, -0.7]), target, up, 60, 96, 192)
+    buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
+    behind = (buffers["albedo"] == 0).all(0)
+    assert behind.mean() > 0.5
+    assert buffers["mirrored_albedo"][:, behind].any() == (panes == 2)
+
+
 # ---- G-buffer -------------------------------------------------------------------------------------------
 
 
