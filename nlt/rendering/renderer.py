@@ -33,8 +33,8 @@ _WALL = 0.005  # metres by which the room shrinks, so that photons that hit a wa
 _PLACES_COARSE, _PLACES_FINE, _FINE = 8, 4, 128
 _EMISSION_PLACES = 16
 _SHADOW_RAYS = 16  # of a pixel to each emitter; of a fine pixel one from each place if all lamps are flat
-# A ray is followed from a mirror, and through a thin pane or both sides of a thick one. Through more, as in a wine glass,
-# one of the few rays in a pixel may find a lamp that almost no path finds, and the pixel becomes a bright dot.
+# A ray is followed from a mirror, and through a thin pane or both sides of a thick one. Through more, as in a wine
+# glass, one of a pixel's few rays may find a lamp that almost no path finds, and the pixel becomes a bright dot.
 _MOST_MIRRORS = 2
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
@@ -142,9 +142,9 @@ class Renderer:
         """Trace primary rays, and shadow rays if `direct`. They pass through the transparent parts of opacity masks.
 
         Shadow rays start at eight places in each pixel, in images of some 200 pixels or more at four, or at the surface
-        that a mirror or pane shows there; only two of these are followed. They go to 16 fixed points of each lamp and of the environment, two or four
-        from each place; in such large images one from each place, if all lamps have at most two triangles and none face
-        away. So there is no noise, and a penumbra has a few shades.
+        that at most two mirrors or sides of a pane show there. They go to 16 fixed points of each lamp and of the
+        environment, two or four from each place; in such large images one from each place, if all lamps have at most
+        two triangles and none face away. So there is no noise, and a penumbra has a few shades.
 
         Returns:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
