@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -28,6 +28,7 @@ DOUBLED = 2.0  # growth over the clean error at which a method breaks
 _CEILING = 1e3  # growth at which curves are clipped
 _ACROSS = 6  # panels of curves in a row
 _WORST = 8  # rows of the gallery
+_RESAMPLES = 1000  # of the views, for intervals
 _DENOISER = "oidn_1"  # what a method must not be worse than
 _WORSE = 1.1  # ratio of errors above which it is
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
@@ -75,6 +76,12 @@ class Stressed:
         """Return the rows of a method's views at a severity; none where the ladder does not affect the method."""
         return self._groups.get((method, *ladder, severity), [])
 
+    def _by_view(self, method: str, ladder: Ladder) -> np.ndarray:
+        """Return a method's errors (S + 1, V) by severity, the clean one first, and view; S is 0 if nothing changes."""
+        changed = (self.views(method, ladder, severity) for severity in range(1, 6))
+        by_severity = [self.views(method, (CLEAN, "views"), 0), *filter(None, changed)]
+        return np.array([[row["error"] for row in rows] for rows in by_severity])
+
     def mean(self, method: str, ladder: Ladder, severity: int, key: str = "error") -> float:
         """Return a column's mean over those rows; NaN if there are none."""
         rows = self.views(method, ladder, severity)
@@ -93,9 +100,9 @@ class Stressed:
         errors: dict[Ladder, dict[str, np.ndarray]] = {}
         ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
         for ladder, method in itertools.product(ladders, self.methods):
-            means = [max(self.mean(method, ladder, k), 0.0) for k in range(1, 6) if self.views(method, ladder, k)]
-            if means:
-                errors.setdefault(ladder, {})[method] = np.array([self.clean(method), *means])
+            by_view = self._by_view(method, ladder)
+            if len(by_view) > 1:
+                errors.setdefault(ladder, {})[method] = _means(by_view)
         return errors
 
     @cached_property
@@ -106,10 +113,26 @@ class Stressed:
             ladder: {m: breaking_point(own / own[0]) for m, own in by_method.items()} for ladder, by_method in errors
         }
 
+    @cached_property
+    def intervals(self) -> dict[Ladder, dict[str, tuple[float, float]]]:
+        """The 95% interval of each of `breaks`, bootstrapped over the views; its ends may be infinite."""
+        return {
+            ladder: {method: _interval(self._by_view(method, ladder)) for method in own}
+            for ladder, own in self.errors.items()
+        }
+
     def break_text(self, ladder: Ladder, method: str) -> str:
         """Return a breaking point as text: > and the highest severity where the method never breaks."""
-        at = self.breaks[ladder][method]
-        return f"{at:.1f}" if math.isfinite(at) else f"> {len(self.errors[ladder][method]) - 1}"
+        return self._severity_text(ladder, method, self.breaks[ladder][method])
+
+    def break_cell(self, ladder: Ladder, method: str) -> str:
+        """Return the same with the interval in brackets, which is left out if no choice of views breaks the method."""
+        low, high = self.intervals[ladder][method]
+        text = partial(self._severity_text, ladder, method)
+        return self.break_text(ladder, method) + (f" [{text(low)}, {text(high)}]" if math.isfinite(low) else "")
+
+    def _severity_text(self, ladder: Ladder, method: str, severity: float) -> str:
+        return f"{severity:.1f}" if math.isfinite(severity) else f"> {len(self.errors[ladder][method]) - 1}"
 
 
 def breaking_point(growth: np.ndarray) -> float:
@@ -118,6 +141,22 @@ def breaking_point(growth: np.ndarray) -> float:
         if after >= DOUBLED:
             return float(severity + (DOUBLED - before) / (after - before))
     return math.inf
+
+
+def _means(by_view: np.ndarray) -> np.ndarray:
+    """Return the mean errors (S + 1,) over views (S + 1, V); a negative one on changed views counts as zero."""
+    means = by_view.mean(1)
+    return np.append(means[:1], np.maximum(means[1:], 0.0))
+
+
+def _interval(by_view: np.ndarray) -> tuple[float, float]:
+    """Return the 95% interval of the breaking point, bootstrapped over views (S + 1, V)."""
+    rng, views = np.random.default_rng(0), by_view.shape[1]
+    drawn = (_means(by_view[:, rng.integers(0, views, views)]) for _ in range(_RESAMPLES))
+    points = [breaking_point(means / means[0]) if means[0] > 0 else 0.0 for means in drawn]
+    # Not interpolated, because the points may be infinite.
+    low, high = np.percentile(points, (2.5, 97.5), method="inverted_cdf")
+    return float(low), float(high)
 
 
 def stress_section(results: Path) -> Section | None:
@@ -151,7 +190,8 @@ def _breaking_rows(stressed: Stressed) -> list[Row]:
             row: Row = {"method": method, "suite": ladder[0], "ladder": ladder[1]}
             for column, values in {"error": own, "growth": own / own[0], "rank": own_ranks}.items():
                 row |= {f"{column}_{k}": value for k, value in enumerate(values)}
-            rows.append(row | {"breaks_at": stressed.breaks[ladder][method]})
+            low, high = stressed.intervals[ladder][method]
+            rows.append(row | {"breaks_at": stressed.breaks[ladder][method], "breaks_low": low, "breaks_high": high})
     return rows
 
 
@@ -202,8 +242,7 @@ def _tables(stressed: Stressed) -> list[Table]:
     methods = stressed.methods
     points, ranks, flicker, steady = [], [], [], []
     for ladder, errors in stressed.errors.items():
-        growth = {method: f"({own[-1] / own[0]:.2g})" for method, own in errors.items()}
-        cells = [f"{stressed.break_text(ladder, m)} {growth[m]}" if m in errors else _NONE for m in methods]
+        cells = [stressed.break_cell(ladder, method) if method in errors else _NONE for method in methods]
         points.append([stressed.title(ladder), *cells])
         if len(errors) > 1:
             values = np.stack(list(errors.values()))[:, [0, -1]]
@@ -217,7 +256,10 @@ def _tables(stressed: Stressed) -> list[Table]:
             error = lambda kind, method=method: stressed.mean(method, (FLICKER, kind), 0)
             ratios = ((of(kind + STEADY) / of(kind) for of in (value, error)) for kind in PATHS)
             steady.append([label(method), *(_number(ratio) for pair in ratios for ratio in pair)])
-    note = "Severity at which the error doubles; > where it does not up to the highest; in brackets the growth there."
+    note = (
+        "Severity at which the error doubles; > where it does not up to the highest. In brackets is the 95% interval, "
+        "bootstrapped over the views; there is none where no choice of them would break the method."
+    )
     flicker_note = (
         "Standard deviation of a pixel over draws in a fixed scene, in % of the image's root mean square; and the mean "
         "square change from frame to frame on a smooth path, over the reference's."

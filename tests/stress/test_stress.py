@@ -33,7 +33,7 @@ from nlt.stress.changed_scene import MESHES, ChangedScene
 from nlt.stress.inputs import INPUTS
 from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
-from nlt.stress.report import breaking_point, stress_section
+from nlt.stress.report import Stressed, breaking_point, stress_section
 from nlt.stress.suites import FLICKER, PATHS, ROWS, STEADY, load_suites
 from nlt.stress.views import nearest_embeddings
 
@@ -257,6 +257,23 @@ def test_breaking_point(growth, point):
 # --- what rows say ---
 
 
+def test_interval_of_a_breaking_point(tmp_path):
+    """Of two views, each alone is drawn twice in a quarter of the draws, so their breaking points are the ends."""
+    growth = {"cnn": [(1, 3, 3, 3, 3, 3), (1, 1, 1, 1, 3, 3)], "nlt": [(1, 3, 3, 3, 3, 3), (1, 1, 1, 1, 1, 1)]}
+    rows = [
+        {"method": method, "suite": suite, "ladder": ladder, "severity": severity, "scene": 0, "view": view,
+         "error": own[severity], "nonfinite": 0}
+        for method, views in growth.items()
+        for view, own in enumerate(views)
+        for suite, ladder, severity in [("clean", "views", 0), *(("light", "brighter", k) for k in range(1, 6))]
+    ]  # fmt: skip
+    stressed = Stressed(tmp_path, {"manifest": yaml.safe_load(MANIFEST.read_text())}, rows, [])
+    for method, views in growth.items():
+        alone = [breaking_point(np.array(own)) for own in views]
+        assert stressed.intervals["light", "brighter"][method] == (min(alone), max(alone))
+    assert stressed.break_cell(("light", "brighter"), "nlt") == "1.0 [0.5, > 5]"
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Made-up stress rows and results of a comparison are drawn; one pixel of the CNN is not finite."""
@@ -337,7 +354,7 @@ def test_report(made):
     section = page[page.index('<section id="stress"') :].partition("</section>")[0]
     assert f"<strong>{label('cnn')}</strong> has a clean error of 0.1." in section
     assert section.count("<figure>") == 2 and section.count("<table") == 2 and 'download="stress.csv"' in section
-    assert "> 5 (1.2)" in section.replace("&gt;", ">")
+    assert ">1.0 [1.0, 1.0]<" in section and ">&gt; 5<" in section
 
 
 # --- the command ---
