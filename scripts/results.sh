@@ -22,8 +22,11 @@ table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then
-    room --config table2_real_demodulated --seeds 2 --out results/real_living_room \
+    room --config table2_real_demodulated --seeds 3 --out results/real_living_room \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
+    once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
+        --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
+        nlt_photons guided_1spp guided_1spp@direct_corrected oidn_1 oidn_4
     room --config table2_real_demodulated --scale medium --out results/real_living_room_256 \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct
     once python benchmarks/error_spectra.py results/real_living_room_256
