@@ -49,19 +49,21 @@ if [ "$scale" = small ]; then
         --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow \
         guided_1spp_1_16@direct_narrow oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
-        --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected guided_1_1@direct \
-        guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
+        --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
+        guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
         oidn_1_balanced oidn_1 oidn_4
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
         --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
-        guided_1spp@direct_corrected oidn_1 oidn_4
+        guided_1spp@direct_corrected guided_1spp_relative@direct_corrected oidn_1 oidn_4
     once python scripts/teaser.py results/front_256 --view 8 \
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        guided_1_1@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        guided_1spp_relative@direct_corrected guided_1_1@direct \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
-        --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected oidn_1 oidn_4
+        --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
+        guided_1spp_relative@direct_corrected oidn_1 oidn_4
     once nlt stress --config demo --out results/trainings_builtin --suites training \
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
     once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
