@@ -24,6 +24,8 @@ table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64
 if [ "$scale" = small ]; then
     room --config table2_real_demodulated --seeds 3 --out results/real_living_room \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
+    once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --workers "${WORKERS:-2}" \
+        --out results/real_dining_room --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
     once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
         --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
         nlt_photons guided_1spp guided_1spp@direct_corrected oidn_1 oidn_4
