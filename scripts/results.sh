@@ -52,8 +52,8 @@ if [ "$scale" = small ]; then
         guided_1spp_1_16@direct_narrow oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
-        oidn_1_balanced oidn_1 oidn_4
+        guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
+        guided_1spp@direct_corrected_other_rooms oidn_1_balanced oidn_1 oidn_4
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
         --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
         guided_1spp@direct_corrected guided_1spp_relative@direct_corrected oidn_1 oidn_4

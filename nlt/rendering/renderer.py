@@ -423,6 +423,8 @@ def _hammersley(k: Any, count: int) -> Any:
 def _through_mirrors(scene: Any, surface: Any, masks: bool) -> tuple[Any, Any, Any]:
     """Follow the ray that hit `surface` on to the first that is no mirror or clear glass, through glass where possible.
 
+    It is followed by way of at most `_MOST_MIRRORS`.
+
     Returns the interaction there, the share of its radiance that reaches the camera, and the number of mirrors and
     panes on the way.
     """

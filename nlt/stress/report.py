@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -33,6 +34,7 @@ _DENOISER = "oidn_1"  # what a method must not be worse than
 _WORSE = 1.1  # ratio of errors above which it is
 _FLICKERS = {"points": "points", "photons": "photons", "noise": "input noise"}
 _NONE = "–"
+T = TypeVar("T")
 Row = dict[str, Any]
 Ladder = tuple[str, str]  # suite and name
 
@@ -76,12 +78,6 @@ class Stressed:
         """Return the rows of a method's views at a severity; none where the ladder does not affect the method."""
         return self._groups.get((method, *ladder, severity), [])
 
-    def _by_view(self, method: str, ladder: Ladder) -> np.ndarray:
-        """Return a method's errors (S + 1, V) by severity, the clean one first, and view; S is 0 if nothing changes."""
-        changed = (self.views(method, ladder, severity) for severity in range(1, 6))
-        by_severity = [self.views(method, (CLEAN, "views"), 0), *filter(None, changed)]
-        return np.array([[row["error"] for row in rows] for rows in by_severity])
-
     def mean(self, method: str, ladder: Ladder, severity: int, key: str = "error") -> float:
         """Return a column's mean over those rows; NaN if there are none."""
         rows = self.views(method, ladder, severity)
@@ -92,34 +88,38 @@ class Stressed:
         return self.mean(method, (CLEAN, "views"), 0)
 
     @cached_property
+    def _by_view(self) -> dict[Ladder, dict[str, np.ndarray]]:
+        """The errors (S + 1, V) by severity, the clean one first, and view, of the methods that each ladder affects.
+
+        Ladders without rows are left out.
+        """
+        errors: dict[Ladder, dict[str, np.ndarray]] = {}
+        ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
+        for ladder, method in itertools.product(ladders, self.methods):
+            changed = [rows for severity in range(1, 6) if (rows := self.views(method, ladder, severity))]
+            if changed:
+                by_severity = [self.views(method, (CLEAN, "views"), 0), *changed]
+                own = np.array([[row["error"] for row in rows] for rows in by_severity])
+                errors.setdefault(ladder, {})[method] = own
+        return errors
+
+    @cached_property
     def errors(self) -> dict[Ladder, dict[str, np.ndarray]]:
         """The mean errors (S + 1,) by severity, the clean one first, of the methods that each ladder affects.
 
         A negative estimate, which an unbiased one may be, counts as zero. Ladders without rows are left out.
         """
-        errors: dict[Ladder, dict[str, np.ndarray]] = {}
-        ladders = [(suite, name) for suite in (*RENDERED, *COMPUTED) for name in self.manifest["manifest"][suite]]
-        for ladder, method in itertools.product(ladders, self.methods):
-            by_view = self._by_view(method, ladder)
-            if len(by_view) > 1:
-                errors.setdefault(ladder, {})[method] = _means(by_view)
-        return errors
+        return _map(_means, self._by_view)
 
     @cached_property
     def breaks(self) -> dict[Ladder, dict[str, float]]:
         """The breaking point of each method on each ladder, for the same ones as `errors`."""
-        errors = self.errors.items()
-        return {
-            ladder: {m: breaking_point(own / own[0]) for m, own in by_method.items()} for ladder, by_method in errors
-        }
+        return _map(lambda own: breaking_point(own / own[0]), self.errors)
 
     @cached_property
     def intervals(self) -> dict[Ladder, dict[str, tuple[float, float]]]:
         """The 95% interval of each of `breaks`, bootstrapped over the views; its ends may be infinite."""
-        return {
-            ladder: {method: _interval(self._by_view(method, ladder)) for method in own}
-            for ladder, own in self.errors.items()
-        }
+        return _map(_interval, self._by_view)
 
     def break_text(self, ladder: Ladder, method: str) -> str:
         """Return a breaking point as text: > and the highest severity where the method never breaks."""
@@ -133,6 +133,11 @@ class Stressed:
 
     def _severity_text(self, ladder: Ladder, method: str, severity: float) -> str:
         return f"{severity:.1f}" if math.isfinite(severity) else f"> {len(self.errors[ladder][method]) - 1}"
+
+
+def _map(of: Callable[[np.ndarray], T], table: dict[Ladder, dict[str, np.ndarray]]) -> dict[Ladder, dict[str, T]]:
+    """Return the same table with `of` each entry."""
+    return {ladder: {method: of(own) for method, own in row.items()} for ladder, row in table.items()}
 
 
 def breaking_point(growth: np.ndarray) -> float:

@@ -186,17 +186,17 @@ def nearest_embeddings(method: Method, scene: int, before: Points, after: Points
     """
     embeddings = [module for module in method.modules() if isinstance(module, PointEmbedding)]
     own = [embedding.table.weight.data.clone() for embedding in embeddings]
-    for embedding in embeddings:
-        count = embedding.num_points
-        # The objects are so far apart that the nearest point is of the same object.
-        before_at, after_at = (
-            np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
-        )
-        distance, nearest = cKDTree(before_at).query(after_at)
-        nearest = np.where(distance < 1e6, nearest, np.arange(count))  # objects without former points keep rows
-        rows = embedding.table.weight.data[scene * count : (scene + 1) * count]
-        rows[:] = rows[torch.from_numpy(nearest).to(rows.device)]
     try:
+        for embedding in embeddings:
+            count = embedding.num_points
+            # The objects are so far apart that the nearest point is of the same object.
+            before_at, after_at = (
+                np.column_stack([points["position"], 1e6 * points["object"]])[:count] for points in (before, after)
+            )
+            distance, nearest = cKDTree(before_at).query(after_at)
+            nearest = np.where(distance < 1e6, nearest, np.arange(count))  # objects without former points keep rows
+            rows = embedding.table.weight.data[scene * count : (scene + 1) * count]
+            rows[:] = rows[torch.from_numpy(nearest).to(rows.device)]
         yield
     finally:
         for embedding, weight in zip(embeddings, own, strict=True):
