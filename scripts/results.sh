@@ -20,6 +20,9 @@ fixed_lights() {
 }
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
+front="cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow guided_4spp_1_2@direct
+    guided_4spp@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast
+    oidn_4_balanced oidn_4 path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then
     room --config table2_real_demodulated --seeds 3 --out results/real_living_room \
@@ -41,15 +44,13 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@windows_128 photons_only photons_only@windows_128
     once nlt compare --config front --data demo --scale medium --seeds 3 --workers "${WORKERS:-2}" \
         --out results/front_builtin_256 \
-        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        --methods $front
     room --config front --scale medium --out results/front_living_room_256 \
         --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --seeds 3 --out results/front_256 \
-        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow \
-        guided_1spp_1_16@direct_narrow oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        --methods $front guided_1spp_1_16@direct_narrow
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \

@@ -1,4 +1,4 @@
-"""Guided denoising of one sample per pixel, not in the paper: path tracing, G-buffer, points, photons or a field."""
+"""Guided denoising of a few samples per pixel, not in the paper: path tracing, G-buffer, points, photons or a field."""
 
 from typing import Any
 
@@ -23,6 +23,7 @@ class GuidedOneSample(NeuralField):
     """
 
     architecture = (*NeuralField.architecture, "relative", "gap", "rows_only", "corrected")
+    radiance = "noisy"  # the batch field of path-traced radiance
 
     def __init__(
         self,
@@ -59,7 +60,7 @@ class GuidedOneSample(NeuralField):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return (*super().inputs, "emission", "noisy")
+        return (*super().inputs, "emission", self.radiance)
 
     @property
     def pixel_fraction(self) -> float:
@@ -85,7 +86,7 @@ class GuidedOneSample(NeuralField):
         reflected = expose(image - batch["emission"], exposure).mean(1, keepdim=True).clamp(min=0)
         # Lamps are known, and the pixels at their edges show a part of them.
         lamps = F.max_pool2d(batch["emission"].amax(1, keepdim=True), 3, 1, 1)
-        seen = (expose(batch["noisy"] - image, exposure), albedo, reflected, lamps == 0)
+        seen = (expose(batch[self.radiance] - image, exposure), albedo, reflected, lamps == 0)
         missing = F.interpolate(correction(*map(self._traced, seen)), image.shape[2:], mode="bilinear")
         return image + expose((albedo + LEAST_ALBEDO) * missing, 1 / exposure)
 
@@ -99,7 +100,7 @@ class GuidedOneSample(NeuralField):
 
     def _reflected(self, batch: Batch) -> Tensor:
         """Return the traced pixels' radiance without lamps in view, divided by the albedo (B, 3, rows, columns)."""
-        noisy, emission, albedo = map(self._traced, (batch["noisy"], batch["emission"], self.albedo(batch)))
+        noisy, emission, albedo = map(self._traced, (batch[self.radiance], batch["emission"], self.albedo(batch)))
         return (noisy - emission).clamp(min=0) / (albedo + LEAST_ALBEDO)
 
     def _traced(self, image: Tensor) -> Tensor:
@@ -112,3 +113,9 @@ class GuidedOneSample(NeuralField):
         """The distance from a traced pixel to the next, in rows and in columns."""
         k = self.hparams["gap"] + 1
         return k, 1 if self.hparams["rows_only"] else k
+
+
+class GuidedFourSamples(GuidedOneSample):
+    """The same with 4 spp in each traced pixel. It trains towards the 1-spp image."""
+
+    radiance = "noisy_input"

@@ -61,9 +61,14 @@ UNTRAINED = (
     "path_tracing_4",
     "path_tracing_16",
     "oidn_1",
+    "oidn_2",
     "oidn_4",
     "oidn_1_balanced",
+    "oidn_2_balanced",
+    "oidn_4_balanced",
     "oidn_1_fast",
+    "oidn_2_fast",
+    "oidn_4_fast",
     "oidn_1_mirrors",
 )
 STEPS = 6  # 4 to an epoch
@@ -734,11 +739,13 @@ def test_training_images(world, trainings, capfd):
 def test_curves_of_denoising(tmp_path):
     """Guided denoising and OIDN's faster modes are not joined with the rows that share their class."""
     names = ["denoising_1_1", "denoising_1_4", "guided_1_1", "guided_1_4", "oidn_1", "oidn_1_fast", "oidn_4"]
+    names += ["oidn_1_balanced", "oidn_4_balanced"]
     found = curves(make_results(tmp_path, {name: {"time_per_frame_s": 1.0} for name in names}, None))
     assert found == {
         "Denoising (pixels traced)": ["denoising_1_4", "denoising_1_1"],
         "Guided denoising (pixels traced)": ["guided_1_4", "guided_1_1"],
         "OIDN (spp)": ["oidn_1", "oidn_4"],
+        "OIDN balanced (spp)": ["oidn_1_balanced", "oidn_4_balanced"],
     }
 
 

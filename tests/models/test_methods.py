@@ -20,7 +20,7 @@ from nlt.baselines.ablation import INPUTS, InputAblation
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising, pixel_mask
 from nlt.baselines.feature_projection import FeatureProjection
-from nlt.baselines.guided import GuidedOneSample
+from nlt.baselines.guided import GuidedFourSamples, GuidedOneSample
 from nlt.baselines.path_tracing import OpenImageDenoise
 from nlt.cli import main
 from nlt.config import read_configs
@@ -129,6 +129,7 @@ def test_stages_are_those_of_the_inputs(method):
         "field": ("gbuffer", "photons"),
         "guided_1spp": ("gbuffer", "path_tracing"),
         "guided_1spp_field": ("gbuffer", "photons", "path_tracing"),
+        "guided_4spp": ("gbuffer", "path_tracing"),
         "guided_1_64": ("gbuffer", "path_tracing"),
         "denoising_1_1": ("path_tracing",),
         "ablation_1": ("gbuffer",),
@@ -574,6 +575,7 @@ def test_mask_is_fixed_in_evaluation_and_fresh_in_training(step):
         (GuidedOneSample(gap=1, width=4), "noisy"),
         (GuidedOneSample(gap=1, rows_only=True, width=4), "noisy"),
         (GuidedOneSample(gap=2, width=4, relative=True), "noisy"),
+        (GuidedFourSamples(gap=1, rows_only=True, width=4), "noisy_input"),
     ],
 )
 @torch.no_grad()
