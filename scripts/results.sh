@@ -20,8 +20,8 @@ fixed_lights() {
 }
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
-front="cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow guided_4spp_1_2@direct
-    guided_4spp@direct oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast
+front="cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow guided_4spp@direct
+    oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast
     oidn_4_balanced oidn_4 path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then
@@ -50,7 +50,7 @@ if [ "$scale" = small ]; then
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --seeds 3 --out results/front_256 \
-        --methods $front guided_1spp_1_16@direct_narrow
+        --methods $front guided_1spp_1_16@direct_narrow guided_4spp_1_2@direct
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
