@@ -54,7 +54,7 @@ if [ "$scale" = small ]; then
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
-        guided_1spp@direct_corrected_other_rooms oidn_1_balanced oidn_1 oidn_2_balanced oidn_2 oidn_4_balanced oidn_4
+        guided_1spp@direct_corrected_other_rooms oidn_1_balanced oidn_1 oidn_4
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
         --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
         guided_1spp@direct_corrected guided_1spp_relative@direct_corrected oidn_1 oidn_4
@@ -62,8 +62,8 @@ if [ "$scale" = small ]; then
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        guided_1spp_relative@direct_corrected guided_1_1@direct oidn_1_fast oidn_1_balanced oidn_1 \
-        oidn_2_balanced oidn_2 oidn_4_balanced oidn_4 path_tracing_1 path_tracing_4
+        guided_1spp_relative@direct_corrected guided_1_1@direct \
+        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected oidn_1 oidn_4

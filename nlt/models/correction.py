@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 _WINDOWS = (32, 16, 8)  # pixels; those of 4 leave mottles
-_TRUST = 2.0  # a correction counts as far as its square is more than this times its variance
+_TRUST = 3.0  # a correction counts as far as its square is more than this times its variance
 LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
 _DARK = 0.1  # exposed radiance below which the noise is about the same everywhere
 
@@ -18,9 +18,8 @@ def correction(residual: Tensor, albedo: Tensor, brightness: Tensor, valid: Tens
     """Return the irradiance that an image lacks, by least squares in windows of 32, 16 and 8 pixels.
 
     In each window, a constant times the albedo explains the residual. Of this constant c with variance v, only
-    c * max(0, 1 - 2 v / c²) is kept (James and Stein 1961), so where noise is all there is, nothing is added. Windows
-    overlap by half, and the result is interpolated between their centres. Smaller windows explain what larger ones
-    leave.
+    c * max(0, 1 - 3 v / c²) is kept (James and Stein 1961), so where noise is all there is, nothing is added. Smaller
+    windows explain what larger ones leave.
 
     Args:
         residual: (B, 3, H, W), noisy pixels minus the image, in exposed radiance.
@@ -36,27 +35,24 @@ def correction(residual: Tensor, albedo: Tensor, brightness: Tensor, valid: Tens
     height, width = residual.shape[-2:]
     missing = torch.zeros_like(residual)
     for size in _WINDOWS:
-        fitted, doubt = _fit(residual - albedo * missing, albedo, weight, size)
+        rest = residual - albedo * missing
+        fitted, doubt = _fit(rest, albedo, weight, size)
         kept = fitted * (1 - _TRUST * doubt).clamp(min=0)
-        between = F.interpolate(kept, scale_factor=size // 2, mode="bilinear", align_corners=False)
-        edge = size // 4  # pixels outside the image: the first window's centre is its corner
-        missing = missing + between[..., edge : edge + height, edge : edge + width]
+        missing = missing + F.interpolate(kept, size=(height, width), mode="bilinear", align_corners=False)
     return missing
 
 
 def _fit(rest: Tensor, albedo: Tensor, weight: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return the weighted least-squares factor c of each window, and its variance relative to c².
-
-    Window k of a row or column covers the pixels from (k - 1) size / 2 to (k + 1) size / 2.
-    """
-    total = lambda image: F.avg_pool2d(image, size, size // 2, size // 2, ceil_mode=True, divisor_override=1)
-    share, moment = weight * albedo.square(), weight * albedo * rest
-    shares, squares = total(share).clamp(min=1e-9), total(share.square())
-    fitted = total(moment) / shares
-    # The sum of (moment - share * fitted)².
-    error = total(moment.square()) - fitted * (2 * total(moment * share) - fitted * squares)
+    """Return the weighted least-squares factor c of each window, and its variance relative to c²."""
+    height, width = rest.shape[-2:]
+    total = lambda image: F.avg_pool2d(image, size, ceil_mode=True, divisor_override=1)
+    share = weight * albedo.square()
+    shares = total(share).clamp(min=1e-9)
+    fitted = total(weight * albedo * rest) / shares
+    spread = fitted.repeat_interleave(size, 2).repeat_interleave(size, 3)[..., :height, :width]
+    error = weight * albedo * (rest - albedo * spread)
     # A pixel that alone decides c has no error; the less the others weigh, the less its error says.
-    errors = error.clamp(min=0) / (1 - squares / shares.square()).clamp(min=1e-3)
+    errors = total(error.square()) / (1 - total(share.square()) / shares.square()).clamp(min=1e-3)
     # A window without any bright outlier looks less noisy than it is; the windows around it know better.
     around = lambda image: F.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
     variance = torch.maximum(errors, around(errors) / around(shares) * shares) / shares.square()

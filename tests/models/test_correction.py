@@ -25,19 +25,18 @@ def scene(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torc
 
 
 def test_fit_equals_a_loop():
-    """Least squares and the variance of its factor, window by window, with partial windows at the edges."""
+    """Least squares and the variance of its factor, window by window, with a last row and column of partial windows."""
     generator = torch.Generator().manual_seed(1)
     shape, size = (1, 3, 20, 28), 8
     rest, albedo = torch.randn(shape, generator=generator), 0.1 + torch.rand(shape, generator=generator)
     weight = torch.rand(1, 1, *shape[2:], generator=generator)
     fitted, relative = _fit(rest, albedo, weight, size)
-    step = size // 2
-    rows, columns = -(-shape[2] // step) + 1, -(-shape[3] // step) + 1
+    rows, columns = -(-shape[2] // size), -(-shape[3] // size)
     assert fitted.shape == relative.shape == (1, 3, rows, columns)
     r, a, w = (x.expand(shape)[0].double().numpy() for x in (rest, albedo, weight))
     errors, shares, factors = np.empty((3, 3, rows, columns))
     for channel, row, column in np.ndindex(errors.shape):
-        cut = (channel, *(slice(max(k - 1, 0) * step, (k + 1) * step) for k in (row, column)))
+        cut = (channel, slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size))
         x, y = (np.sqrt(w[cut]) * a[cut]).ravel(), (np.sqrt(w[cut]) * r[cut]).ravel()
         (factors[channel, row, column],), *_ = np.linalg.lstsq(x[:, None], y)
         leverage = (x**4).sum() / (x**2).sum() ** 2
