@@ -7,10 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlt.baselines.neural_field import NeuralField
-from nlt.display import expose
-from nlt.errors import UserError
-from nlt.models.correction import LEAST_ALBEDO, correction
-from nlt.models.module import Batch, join_channels, log_exposed
+from nlt.models.correction import LEAST_ALBEDO, corrected
+from nlt.models.module import Batch, check_at_least, join_channels, log_exposed
 
 _DARKEST = 1e-6  # W·sr⁻¹·m⁻²; keeps the exposure of a black image finite
 
@@ -50,8 +48,7 @@ class GuidedOneSample(NeuralField):
             corrected: add what the image lacks in areas, by its noisy pixels (nlt/models/correction.py); in training,
                 too.
         """
-        if gap < 0:
-            raise UserError(f"model.init_args.gap: must be 0 or more, is {gap}")
+        check_at_least(0, gap=gap)
         super().__init__(field_width, use_points, use_photons, **kwargs)
 
     @property
@@ -82,13 +79,7 @@ class GuidedOneSample(NeuralField):
         image = super().to_radiance(batch, channels)
         if not self.hparams["corrected"]:
             return image
-        albedo, exposure = self.albedo(batch), batch["exposure"]
-        reflected = expose(image - batch["emission"], exposure).mean(1, keepdim=True).clamp(min=0)
-        # Lamps are known, and the pixels at their edges show a part of them.
-        lamps = F.max_pool2d(batch["emission"].amax(1, keepdim=True), 3, 1, 1)
-        seen = (expose(batch[self.radiance] - image, exposure), albedo, reflected, lamps == 0)
-        missing = F.interpolate(correction(*map(self._traced, seen)), image.shape[2:], mode="bilinear")
-        return image + expose((albedo + LEAST_ALBEDO) * missing, 1 / exposure)
+        return corrected(image, batch[self.radiance], batch, self.albedo(batch), self._traced)
 
     def exposure(self, batch: Batch) -> Tensor:
         """Return the scene's exposure (B,), or that which the noisy image itself asks for in each channel (B, 3)."""

@@ -4,14 +4,38 @@ Noisy pixels are unbiased, so their mean difference to an image is the image's e
 Noise hides the error of a pixel, but not that of an area.
 """
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from nlt.display import expose
+from nlt.models.method import Batch
 
 _WINDOWS = (32, 16, 8)  # pixels; those of 4 leave mottles
 _TRUST = 3.0  # a correction counts as far as its square is more than this times its variance
 LEAST_ALBEDO = 0.05  # added to the albedo, which is 0 on mirrors
 _DARK = 0.1  # exposed radiance below which the noise is about the same everywhere
+
+
+def corrected(image: Tensor, noisy: Tensor, batch: Batch, albedo: Tensor, traced: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return an image (B, 3, H, W), in linear radiance, plus what its noisy pixels show that it lacks.
+
+    Args:
+        image: linear radiance.
+        noisy: (B, 3, H, W), path-traced radiance.
+        batch: with the `emission` and `exposure` of the view.
+        albedo: (B, 3, H, W).
+        traced: returns the path-traced pixels of any map (B, C, H, W).
+    """
+    exposure = batch["exposure"]
+    reflected = expose(image - batch["emission"], exposure).mean(1, keepdim=True).clamp(min=0)
+    # Lamps are known, and the pixels at their edges show a part of them.
+    lamps = F.max_pool2d(batch["emission"].amax(1, keepdim=True), 3, 1, 1)
+    seen = (expose(noisy - image, exposure), albedo, reflected, lamps == 0)
+    missing = F.interpolate(correction(*map(traced, seen)), image.shape[2:], mode="bilinear")
+    return image + expose((albedo + LEAST_ALBEDO) * missing, 1 / exposure)
 
 
 def correction(residual: Tensor, albedo: Tensor, brightness: Tensor, valid: Tensor) -> Tensor:
