@@ -1,8 +1,8 @@
-"""Checks whether `nlt select` picks the model that a scene needs, in four scenes, and what each pick saves.
+"""Checks whether `nlt select` picks the model that a scene needs, in five scenes, and what each pick saves.
 
     python benchmarks/selection.py --minutes 6
 
-Runs `nlt select` for a static scene, a room with fixed lights and two with a moving light, and writes summary.md and
+Runs `nlt select` for a static scene, a room with fixed lights and three with a moving light, and writes summary.md and
 summary.csv: each pick against always taking the full model and against picking by the number of parameters. A claim
 that does not hold is printed as failing. A complete selection is not repeated.
 """
@@ -20,7 +20,7 @@ from nlt.evaluation.results import read_rows, write_rows
 from nlt.select.output import summary
 
 # In configs/select.
-CASES = ("static_egg", "fixed_lights", "demo", "real_living_room")
+CASES = ("static_egg", "fixed_lights", "demo", "real_living_room", "real_dining_room")
 
 
 def main() -> None:

@@ -20,9 +20,9 @@ fixed_lights() {
 }
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
+peers="oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast oidn_4_balanced oidn_4"
 front="cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow guided_4spp@direct
-    oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast
-    oidn_4_balanced oidn_4 path_tracing_1 path_tracing_4"
+    $peers path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then
     room --config table2_real_demodulated --seeds 3 --out results/real_living_room \
@@ -32,11 +32,13 @@ if [ "$scale" = small ]; then
     once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
         --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
         nlt_photons guided_1spp guided_1spp@direct_corrected oidn_1 oidn_4
-    room --config table2_real_demodulated --scale medium --out results/real_living_room_256 \
+    room --config table2_real_demodulated --scale medium --seeds 3 --out results/real_living_room_256 \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct
     once python benchmarks/error_spectra.py results/real_living_room_256
     room --config table2_real --scale medium --methods $table2 --out results/real_living_room_256_radiance
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
+    once nlt compare --config table1_real_demodulated --data demo_fixed_lights --workers "${WORKERS:-2}" \
+        --out results/builtin_fixed_lights --methods guided_1spp $table2 cnn@direct
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
@@ -54,7 +56,7 @@ if [ "$scale" = small ]; then
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
-        guided_1spp@direct_corrected_other_rooms oidn_1_balanced oidn_1 oidn_4
+        guided_1spp@direct_corrected_other_rooms $peers
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
         --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
         guided_1spp@direct_corrected guided_1spp_relative@direct_corrected oidn_1 oidn_4
@@ -62,8 +64,7 @@ if [ "$scale" = small ]; then
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        guided_1spp_relative@direct_corrected guided_1_1@direct \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        guided_1spp_relative@direct_corrected guided_1_1@direct $peers path_tracing_1 path_tracing_4
     once nlt stress --config demo --out results/front_builtin --suites light geometry materials camera frame \
         --methods cnn cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected oidn_1 oidn_4
