@@ -66,10 +66,11 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
     for k, (name, members) in enumerate(families.items()):
         colour = _CURVES[k % len(_CURVES)]
         drawn = [method for method in members if method in points]
-        _plot(axis, results, key, {m: points[m] for m in drawn}, label=name, color=colour, ls=plots.DASHES[k % 4],
+        entry, labels = _labels(name, members)
+        _plot(axis, results, key, {m: points[m] for m in drawn}, label=entry, color=colour, ls=plots.DASHES[k % 4],
               marker="x+."[k % 3])  # fmt: skip
         for number, m in enumerate(drawn):
-            plots.annotate(axis, setting(m), points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
+            plots.annotate(axis, labels[m], points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
     for k, m in enumerate(_alone(results, families)):
         point = {m: points[m]} if m in points else {}
         _plot(axis, results, key, point, label=label(m), ls="", mec="white", mew=0.6, zorder=3, **plots.style(k))
@@ -136,6 +137,18 @@ def far_behind(results: Results, key: str) -> list[str]:
 def setting(method: str) -> str:
     """Return what tells a method from the others of its curve: its variant, or its pixels or samples per pixel."""
     return method.partition("@")[2] or label(method).partition("(")[2].rstrip(")").removesuffix(" spp")
+
+
+def _labels(curve: str, members: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """Return a curve's entry in the legend, and the label of each of its methods in a panel.
+
+    The names of three or more variants would cover each other, so they stand in the legend, and letters in the panel.
+    """
+    settings = {method: setting(method) for method in members}
+    if len(members) < 3 or "@" not in members[0]:
+        return curve, settings
+    letters = {method: chr(ord("a") + k) for k, method in enumerate(members)}
+    return "\n".join([curve, *(f"{letters[method]}: {settings[method]}" for method in members)]), letters
 
 
 def _alone(results: Results, families: Mapping[str, Sequence[str]]) -> list[str]:

@@ -179,6 +179,19 @@ def test_axes_of_speed_accuracy(tmp_path, monkeypatch):
     assert axes["MSE ↓"] == axes["FID ↓"] == ("log", "log") and axes["MSSIM ↑"] == ("log", "linear")
 
 
+def test_three_variants_are_letters_in_a_panel(tmp_path, monkeypatch):
+    """Their names would cover each other; the legend has them, cheapest first. Two variants are written out."""
+    figures = []
+    monkeypatch.setattr(plots, "save", lambda figure, *_: figures.append(figure))
+    rows = {name: {"mse": 0.01 / k, "time_per_frame_s": 0.01 * k} for k, name in enumerate(
+        ("cnn@tiny", "cnn@small", "cnn@medium", "nlt@tiny", "nlt@small"), 1)}  # fmt: skip
+    draw_speed_accuracy(make_results(tmp_path, rows, None))
+    written = [text.get_text() for axis in figures[0].axes for text in axis.texts]
+    assert {*"abc", "tiny", "small"} <= {*written} and "medium" not in written
+    entries = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert "CNN only, variants\na: tiny\nb: small\nc: medium" in entries and "Ours (w/o photons), variants" in entries
+
+
 def write_and_read(results):
     """The tables of table.md, table.tex and report.html."""
     write_tables(results)
