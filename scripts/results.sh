@@ -38,7 +38,7 @@ if [ "$scale" = small ]; then
     room --config table2_real --scale medium --methods $table2 --out results/real_living_room_256_radiance
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --workers "${WORKERS:-2}" \
-        --out results/builtin_fixed_lights --methods guided_1spp $table2 cnn@direct
+        --out results/builtin_fixed_lights --methods $table2 cnn@direct
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
