@@ -1,6 +1,7 @@
 """Charts of a comparison, drawn from its stored results: accuracy over time per frame, and along the trainings."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -18,6 +19,7 @@ from nlt.report import plots
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 _CURVES = ("0.3", "#8C510A", "#000000")
 _LEARNING = ("mse", "mssim", "fid", "feature_l1", "flip")
+_LINE = 50  # characters of a panel's width, in the smallest print
 _MAX_PANELS = 4  # of the learning curves, per row
 _SHADES = (0.0, 0.65)  # of grey, for the first and the last method of a curve
 
@@ -61,7 +63,7 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
         far = far_behind(results, key)
         points = {method: point for method, point in points.items() if method not in far}
         words = f"not shown: {', '.join(map(label, far))}" if far else ""
-        axis.text(0.98, 0.03, words, fontsize=6, ha="right", transform=axis.transAxes)
+        axis.text(0.98, 0.03, textwrap.fill(words, _LINE), fontsize=6, ha="right", transform=axis.transAxes)
     plots.draw_front(axis, points, METRICS[key].direction)
     for k, (name, members) in enumerate(families.items()):
         colour = _CURVES[k % len(_CURVES)]
