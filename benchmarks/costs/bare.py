@@ -39,7 +39,7 @@ class Bare:
         self.view["to_world"] = sensor_to_world(camera, self.scene.description.units_per_metre)
         self.view.update()
         references = [] if split == "train" else [self.spec.reference_spp] * 2
-        for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, *references)):
+        for k, spp in enumerate((self.spec.noisy_spp, self.spec.input_spp, self.spec.target_spp, *references)):
             self.render(self.path, spp, seed * 8 + k)
         self.render(self.aov, 1, seed)
         self.photons(seed)

@@ -16,12 +16,13 @@ _DARKEST = 1e-6  # W·sr⁻¹·m⁻²; keeps the exposure of a black image finit
 class GuidedOneSample(NeuralField):
     """The paper's method, whose U-Net also sees path-traced radiance at 1 spp; by default without points or photons.
 
-    It reads the 1-spp image, which other methods train towards, and trains towards the 4-spp image, which denoisers
-    read: the two have independent noise, so the Lemma holds (Lehtinen et al. 2018).
+    It reads the 1-spp image, towards which the paper's methods train, so it trains towards the `target` image. The
+    noise of the two is independent, so the Lemma holds (Lehtinen et al. 2018).
     """
 
     architecture = (*NeuralField.architecture, "relative", "gap", "rows_only", "corrected")
     radiance = "noisy"  # the batch field of path-traced radiance
+    target = "target"  # whatever `cleaner_target` says
 
     def __init__(
         self,
@@ -107,6 +108,6 @@ class GuidedOneSample(NeuralField):
 
 
 class GuidedFourSamples(GuidedOneSample):
-    """The same with 4 spp in each traced pixel. It trains towards the 1-spp image."""
+    """The same with 4 spp in each traced pixel."""
 
     radiance = "noisy_input"

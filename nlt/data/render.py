@@ -72,7 +72,7 @@ class SampleRenderer:
     def view(self, camera: Camera, seeds: np.random.SeedSequence, names: Collection[str]) -> dict[str, np.ndarray]:
         """Return the fields `names` of any view of the scene in its current state, at the camera's resolution."""
         spec, state = self.spec, self.scene.state
-        noisy, noisy_input, half_a, half_b, photons = (int(seed) for seed in seeds.generate_state(5))
+        noisy, noisy_input, half_a, half_b, photons, target = (int(seed) for seed in seeds.generate_state(6))
         sizes = spec.sizes("test") | {"H": camera.height, "W": camera.width}
         fields = {name: field for name, field in FIELDS.items() if name in names}
         absent = sizes["M"] - len(state.present)  # another scene of the dataset has more movable objects
@@ -85,6 +85,7 @@ class SampleRenderer:
         images = {
             "noisy": (spec.noisy_spp, noisy),
             "noisy_input": (spec.input_spp, noisy_input),
+            "target": (spec.target_spp, target),
             "reference_a": (spec.reference_spp, half_a),
             "reference_b": (spec.reference_spp, half_b),
         }

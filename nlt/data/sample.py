@@ -44,9 +44,17 @@ class Field:
 _RADIANCE = "W·sr⁻¹·m⁻²"
 
 FIELDS: dict[str, Field] = {
-    "noisy": Field((3, "H", "W"), "float32", _RADIANCE, "path-traced radiance at 1 spp, unclamped; training target"),
+    "noisy": Field(
+        (3, "H", "W"), "float32", _RADIANCE, "path-traced radiance at 1 spp, unclamped; the paper's training target"
+    ),
     "noisy_input": Field(
         (3, "H", "W"), "float32", _RADIANCE, "path-traced radiance at 4 spp with different seeds; denoisers' input"
+    ),
+    "target": Field(
+        (3, "H", "W"),
+        "float32",
+        _RADIANCE,
+        "path-traced radiance at 16 spp with seeds of its own; training target of methods that are not in the paper",
     ),
     "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference", True),
     "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second half, independent of the first", True),

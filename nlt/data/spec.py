@@ -21,7 +21,7 @@ from nlt.errors import UserError
 from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 10  # version of the files on disk
+FORMAT = 11  # version of the files on disk
 _MOST_EVALUATED = 8  # samples in a shard of val or test
 _LEAST_SIDE = 8  # of an image, in pixels
 _DRAWS = 1000  # attempts to find a state that no other split has
@@ -48,14 +48,15 @@ class DatasetSpec:
         test: test samples per scene.
         num_points: surface points per scene.
         num_photons: photons per sample.
-        noisy_spp: samples per pixel of the training target.
+        noisy_spp: samples per pixel of the paper's training target.
         input_spp: samples per pixel of the denoisers' input.
+        target_spp: samples per pixel of the training target of methods that are not in the paper.
         reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the maximum.
         reference_mse: target MSE between the two halves as displayed (sRGB at the scene's exposure). A few pilot views
             of each scene determine the samples per pixel that reach it. With 0, `reference_spp` is used.
         seed: seed of everything random in the dataset.
         shard_size: samples per file; at most 8 in val and test, whose references take a thousand times as long.
-        integrator: integrator of noisy, noisy_input and reference; "scene" uses the one that scene.yaml names.
+        integrator: integrator of noisy, noisy_input, target and reference; "scene" uses the one that scene.yaml names.
 
     Raises:
         UserError: a value has the wrong type or is out of bounds.
@@ -72,6 +73,7 @@ class DatasetSpec:
     num_photons: PositiveInt = 10_000
     noisy_spp: PositiveInt = 1
     input_spp: PositiveInt = 4
+    target_spp: PositiveInt = 16
     reference_spp: PositiveInt = 64
     reference_mse: Annotated[float, Bound(ge=0, allow_inf_nan=False)] = 0.0
     seed: NonNegativeInt = 0

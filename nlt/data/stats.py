@@ -26,6 +26,7 @@ STAGES = {
     "state, view": ("camera_matrix", "world_to_view", "translation", "present"),
     "noisy": ("noisy",),
     "noisy_input": ("noisy_input",),
+    "target": ("target",),
     "G-buffer": (*BUFFERS, *DIRECT),
     "photons": ("photon_origin", "photon_direction", "photon_flux", "photon_hit", "photon_valid"),
     "reference": ("reference_a", "reference_b"),
@@ -128,6 +129,7 @@ def laps(render: SampleRenderer, k: int, store: Callable[[], None]) -> dict[str,
     camera = lap("state, view", lambda: render.place("train", k))
     lap("noisy", lambda: trace.radiance(camera, spec.noisy_spp, k))
     lap("noisy_input", lambda: trace.radiance(camera, spec.input_spp, k))
+    lap("target", lambda: trace.radiance(camera, spec.target_spp, k))
     lap("G-buffer", lambda: trace.gbuffer(camera, direct=True))
     lap("photons", lambda: trace.photons(spec.num_photons, k))
     lap("reference", lambda: trace.radiance(camera, timed_spp(spec), k))

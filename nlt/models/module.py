@@ -84,6 +84,7 @@ class RenderingModule(Method, L.LightningModule):
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
         direct_light: bool = False,
+        cleaner_target: bool = False,
         loss: Literal["mse", "relative_mse"] = "mse",
         optimizer: Literal["adam", "muon"] = "adam",
         learning_rate: float = 5e-4,
@@ -105,6 +106,7 @@ class RenderingModule(Method, L.LightningModule):
                 renderer gives without noise (`Renderer.gbuffer`); with "demodulated", the output adds albedo times
                 direct light, so that the network predicts the rest. Only for methods that read the G-buffer; not in the
                 paper.
+            cleaner_target: train towards the `target` image of 16 spp instead of the paper's `noisy` image of 1 spp.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
                 biases and the embeddings (nlt/models/muon.py).
@@ -156,7 +158,7 @@ class RenderingModule(Method, L.LightningModule):
     @property
     def target(self) -> str:
         """The noisy image that training compares with: one that the method does not read, so that the noise differs."""
-        return "noisy_input" if "noisy" in self.inputs else "noisy"
+        return "target" if self.hparams["cleaner_target"] else "noisy"
 
     @property
     def training_fields(self) -> tuple[str, ...]:

@@ -98,7 +98,8 @@ def test_spec_is_written_as_ever():
     assert written == (
         '{"crop": 0, "experiment": "moving_lights", "input_spp": 4, "integrator": "scene", "noisy_spp": 1, '
         '"num_photons": 10000, "num_points": 10000, "reference_mse": 0.0, "reference_spp": 64, "resolution": 64, '
-        '"scenes": ["living_room"], "seed": 0, "shard_size": 64, "test": 64, "train": 1000, "val": 16}'
+        '"scenes": ["living_room"], "seed": 0, "shard_size": 64, "target_spp": 16, "test": 64, '
+        '"train": 1000, "val": 16}'
     )
 
 

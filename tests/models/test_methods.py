@@ -608,20 +608,25 @@ def test_guides_of_denoising(one_in):
     assert plain.pixel_fraction == guided.pixel_fraction == 1 / one_in
 
 
-def test_one_sample_trains_towards_independent_noise(method):
-    """A method that reads the 1-spp image compares with the other one; its own noise would teach it to copy."""
+def test_the_targets_noise_is_independent(method):
+    """A method that reads a noisy image compares with another one; its own noise would teach it to copy."""
     batch = synthetic_batch()
     reads = "noisy" in method.inputs
-    assert method.target == ("noisy_input" if reads else "noisy") and method.target in method.training_fields
+    assert method.target not in method.fields and method.target in method.training_fields
+    assert method.target == "target" or not isinstance(method, GuidedOneSample)
     method.eval()
     prediction, loss = method(batch), method.noisy_loss(method(batch), batch)
     changed = batch | {method.target: batch[method.target] + 1}
-    if method.target == "noisy":
-        assert torch.equal(method(changed), prediction)
+    assert torch.equal(method(changed), prediction)
     assert not torch.equal(method.noisy_loss(prediction, changed), loss)
     if reads:
         assert method.stages[-1] == "path_tracing"
         assert not torch.equal(method(batch | {"noisy": batch["noisy"] + 1}), prediction)
+
+
+def test_only_what_is_not_in_the_paper_trains_towards_the_cleaner_target():
+    assert build(find_config("model", "cnn")).target == "noisy"
+    assert build(find_config("model", "cnn"), find_config("variant", "direct")).target == "target"
 
 
 def test_denoising_sees_noisy_pixels_alone():
