@@ -58,7 +58,7 @@ def test_fields(dataset):
 
 def test_samples_differ_and_mean_what_they_say(dataset, demo):
     samples = samples_of(dataset, "test") + samples_of(dataset, "train")
-    for name in ("noisy", "noisy_input", "depth", "world_to_view", "photon_origin", "translation"):
+    for name in ("noisy", "noisy_input", "target", "depth", "world_to_view", "photon_origin", "translation"):
         values = [s[name].numpy().tobytes() for s in samples]
         assert len(set(values)) == len(values), name
     for s in samples:

@@ -151,7 +151,7 @@ def test_stats(dataset, tmp_path, monkeypatch, capfd):
     for name in FIELDS:
         assert rows[name][0].replace(",", "") == str(stored[name][0].nbytes), name
     assert rows["noisy"][1].replace(",", "") == str(3 * 24 * 24 * 4)
-    milliseconds = {name: float(rows[name][-1]) for name in ("noisy", "noisy_input", "reference")}
+    milliseconds = {name: float(rows[name][-1]) for name in ("noisy", "noisy_input", "target", "reference")}
     assert all(value > 0 for value in milliseconds.values())
     # 100,048 samples in 98 processes, by one worker.
     hours, train, evaluated, start = map(
@@ -159,7 +159,7 @@ def test_stats(dataset, tmp_path, monkeypatch, capfd):
     )
     assert hours * 3600 == pytest.approx(100_000 * train / 1e3 + 48 * evaluated / 1e3 + 98 * start, abs=60 + 36)
     size = sum(stored[name][0].nbytes for name in ("camera_matrix", "world_to_view", "translation", "present"))
-    size += 24 * 24 * (4 * 3 * 4 + 4 + 3 * 3 * 2) + 50 * (12 + 6 + 12 + 12 + 1)
+    size += 24 * 24 * (5 * 3 * 4 + 4 + 3 * 3 * 2) + 50 * (12 + 6 + 12 + 12 + 1)
     assert f"{(100_048 * size + 48 * 2 * 24 * 24 * 12) / 1e9:.2f} GB" in report
 
 
