@@ -23,10 +23,15 @@ def default_device() -> torch.device:
 
 
 def fast_bfloat16(device: torch.device) -> bool:
-    """Return whether the device multiplies bfloat16 natively; emulated bfloat16 is slower than float32."""
+    """Return whether the device multiplies bfloat16 natively and faster than float32.
+
+    Emulated bfloat16 is slower than float32, and so is that of Intel's processors without AMX (performance-log.csv).
+    """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    return device.type == "cpu" and any("bf16" in name and has for name, has in torch.cpu.get_capabilities().items())
+    has = torch.cpu.get_capabilities()
+    slow = "Intel" in str(has.get("cpu_name")) and not has.get("amx_bf16")
+    return device.type == "cpu" and not slow and any("bf16" in name and has[name] for name in has)
 
 
 def fast_int8(device: torch.device) -> bool:

@@ -117,4 +117,8 @@ def test_precisions(monkeypatch, precision, taken):
     assert Policy.for_device(CPU, precision).int8 == taken
     has["avx512_vnni"] = False
     assert not Policy.for_device(CPU, precision).int8
+    has |= {"cpu_name": "Intel Xeon", "amx_bf16": False}
+    assert Policy.for_device(CPU, precision).bfloat16 == (precision == "bf16"), "without AMX, float32 is faster"
+    has["amx_bf16"] = True
+    assert Policy.for_device(CPU, precision).bfloat16 == (precision != "32")
     assert not Policy.for_device(torch.device("meta")).int8
