@@ -54,7 +54,7 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "path-traced radiance at 16 spp with seeds of its own; training target of methods that are not in the paper",
+        "path-traced radiance at 16 spp with other seeds; training target of some methods that are not in the paper",
     ),
     "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference", True),
     "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second half, independent of the first", True),

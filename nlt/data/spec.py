@@ -50,7 +50,7 @@ class DatasetSpec:
         num_photons: photons per sample.
         noisy_spp: samples per pixel of the paper's training target.
         input_spp: samples per pixel of the denoisers' input.
-        target_spp: samples per pixel of the training target of methods that are not in the paper.
+        target_spp: samples per pixel of the `target`, towards which some methods train that are not in the paper.
         reference_spp: samples per pixel of each of the reference's two halves; with `reference_mse`, the maximum.
         reference_mse: target MSE between the two halves as displayed (sRGB at the scene's exposure). A few pilot views
             of each scene determine the samples per pixel that reach it. With 0, `reference_spp` is used.

@@ -1,4 +1,4 @@
-"""TensorBoard images during training: noisy target, prediction, reference and error of a few samples."""
+"""TensorBoard images during training: 1-spp image, prediction, reference and error of a few samples."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ class ImageGrid(L.Callback):
     """Logs the image "val/images", with one row for each of the first `images` samples.
 
     The image is drawn at the first validation, then at the first validation that is at least `every_n_epochs` epochs
-    after the last image. The columns, after the display transform: noisy target, prediction, reference, and the
+    after the last image. The columns, after the display transform: 1-spp image, prediction, reference, and the
     absolute difference of the last two. Does nothing without a TensorBoard logger and on ranks other than 0.
     """
 
