@@ -52,7 +52,8 @@ if [ "$scale" = small ]; then
         guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
         oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --seeds 3 --out results/front_256 \
-        --methods $front guided_1spp_1_16@direct_narrow guided_4spp_1_2@direct
+        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_16@direct_narrow guided_4spp@direct \
+        guided_4spp_1_2@direct $peers path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
