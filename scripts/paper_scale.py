@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from nlt.config import read_configs
+from nlt.data.sample import SPLITS
 from nlt.data.spec import load_spec
 from nlt.paths import PROJECT, find_config
 
@@ -38,7 +39,7 @@ def tables(bench: Path = PROJECT / "results/bench/target") -> str:
         / 3600
         * (spec.train / generation["train_per_second"] + judged / generation["evaluated_per_second"])
     )
-    disk = scenes * (spec.train * spec.nbytes("train") + judged * spec.nbytes("test"))
+    disk = scenes * sum(spec.count(split) * spec.nbytes(split) for split in SPLITS)
     steps = cores / 3600 * images / training["images_per_second"]
     work = BACKWARD * frame["flops"] * images
     lines = [
@@ -55,7 +56,7 @@ def tables(bench: Path = PROJECT / "results/bench/target") -> str:
         f"| rendering | {rendering:,.0f} core-hours | {scenes} rooms x ({spec.train:,} + {judged:,}) samples / rates "
         f"| ${rendering * CORE_HOUR:,.0f} |",
         f"| disk | {disk / 1e12:.2f} TB | {spec.nbytes('train') / 1e6:.2f} MB a training sample, "
-        f"{spec.nbytes('test') / 1e6:.2f} MB an evaluated one | |",
+        f"{spec.nbytes('test') / 1e6:.2f} MB a test sample | |",
         f"| a training on CPU | {steps:,.0f} core-hours | {images:,} images / rate: out of reach "
         f"| ${steps * CORE_HOUR:,.0f} |",
     ]

@@ -46,8 +46,9 @@ def field_table(fields: dict[str, sample.Field]) -> str:
     """Return a Markdown table with a row per field of a sample."""
     rows = ["| field | shape | dtype | unit | meaning |", "|---|---|---|---|---|"]
     for name, f in fields.items():
-        star, shape = " *" * f.reference_only, ", ".join(map(str, f.shape))
-        rows.append(f"| `{name}`{star} | ({shape}) | {f.dtype} | {f.unit} | {f.meaning} |")
+        where = "" if f.splits == sample.SPLITS else f" ({', '.join(f.splits)})"
+        shape = ", ".join(map(str, f.shape))
+        rows.append(f"| `{name}`{where} | ({shape}) | {f.dtype} | {f.unit} | {f.meaning} |")
     return "\n".join(rows)
 
 

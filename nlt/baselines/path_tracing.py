@@ -47,7 +47,7 @@ class OpenImageDenoise(PathTracing):
         Args:
             spp: samples per pixel.
             quality: OIDN's mode, from fastest to slowest.
-            mirrors: where a mirror or clear glass is seen, the albedo guide is the albedo of what it shows. A frame is
+            mirrors: where metal or glass is seen, the albedo guide is the albedo of what it shows. A frame is
                 then charged for `Renderer.direct`, which also traces shadow rays that OIDN does not need.
         """
         super().__init__(spp)

@@ -30,7 +30,7 @@ class Field:
     dtype: str
     unit: str
     meaning: str
-    reference_only: bool = False  # stored only in the evaluated splits, val and test
+    splits: tuple[str, ...] = SPLITS  # in which it is stored
 
     def resolve(self, sizes: dict[str, int]) -> tuple[int, ...]:
         """Return the shape with the symbols replaced by their sizes."""
@@ -55,13 +55,14 @@ FIELDS: dict[str, Field] = {
         "float32",
         _RADIANCE,
         "path-traced radiance at 16 spp with other seeds; training target of some methods that are not in the paper",
+        splits=("train", "val"),
     ),
-    "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference", True),
-    "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second half, independent of the first", True),
+    "reference_a": Field((3, "H", "W"), "float32", _RADIANCE, "first half of the reference", ("val", "test")),
+    "reference_b": Field((3, "H", "W"), "float32", _RADIANCE, "second half, independent of the first", ("val", "test")),
     "depth": Field((1, "H", "W"), "float32", "m", "camera-space depth z at the pixel centre; 0 if no surface is hit"),
     "normal": Field((3, "H", "W"), "float16", "1", "shading normal in world space; 0 if no surface is hit"),
     "albedo": Field(
-        (3, "H", "W"), "float16", "1", "pixel mean of the diffuse reflectance, in [0, 1]; mirrors and glass have 0"
+        (3, "H", "W"), "float16", "1", "pixel mean of the diffuse reflectance, in [0, 1]; metal and glass have 0"
     ),
     "emission": Field(
         (3, "H", "W"), "float32", _RADIANCE, "pixel mean of the radiance seen directly from lamps and the environment"
@@ -70,14 +71,14 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "radiance that a white diffuse surface there, or seen in a mirror or through clear glass, would reflect of "
+        "radiance that a white diffuse surface there, or seen in metal or through glass, would reflect of "
         "direct light; the pixel's mean weighted by albedo, noise-free",
     ),
     "mirrored_albedo": Field(
         (3, "H", "W"),
         "float16",
         "1",
-        "pixel mean of the albedo seen in a mirror or through clear glass, times what these let pass; elsewhere 0",
+        "pixel mean of the albedo seen in metal or through glass, times what these let pass; elsewhere 0",
     ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, maps view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, maps world space to view space; a rigid transform"),

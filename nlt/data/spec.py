@@ -21,7 +21,7 @@ from nlt.errors import UserError
 from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 11  # version of the files on disk
+FORMAT = 12  # version of the files on disk
 _MOST_EVALUATED = 8  # samples in a shard of val or test
 _LEAST_SIDE = 8  # of an image, in pixels
 _DRAWS = 1000  # attempts to find a state that no other split has
@@ -102,7 +102,7 @@ class DatasetSpec:
 
     def fields(self, split: str) -> dict[str, Field]:
         """Return the fields that a sample of this split stores."""
-        return {name: f for name, f in FIELDS.items() if split != "train" or not f.reference_only}
+        return {name: f for name, f in FIELDS.items() if split in f.splits}
 
     def count(self, split: str) -> int:
         """Return the number of samples per scene in a split."""

@@ -15,7 +15,7 @@ from nlt.data.engines import Died, Process, available_cpus
 from nlt.data.files import open_path
 from nlt.data.generate import SAMPLES_PER_JOB, TIMED_SPP, timed_spp
 from nlt.data.render import SampleRenderer
-from nlt.data.sample import BUFFERS, DIRECT, FIELDS
+from nlt.data.sample import BUFFERS, DIRECT, FIELDS, SPLITS
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import read_spec, references, write_shard
 from nlt.errors import UserError
@@ -75,7 +75,7 @@ def _cost(name: str, spec: DatasetSpec, seconds: dict[str, float], workers: int)
     scenes, evaluated = len(spec.scenes), spec.val + spec.test
     processes = -(-(spec.train + evaluated) // SAMPLES_PER_JOB)
     hours = (spec.train * per_train + evaluated * per_evaluated + processes * seconds["start"]) / workers / 3600
-    size = spec.train * spec.nbytes("train") + evaluated * spec.nbytes("test")
+    size = sum(spec.count(split) * spec.nbytes(split) for split in SPLITS)
     return (
         f"{name}: {scenes} scenes x ({spec.train:,} + {evaluated:,}) samples of {spec.resolution}x{spec.resolution}: "
         f"{scenes * hours:.2f} h with {workers} workers ({1e3 * per_train:.0f} ms per training sample, "

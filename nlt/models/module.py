@@ -102,7 +102,7 @@ class RenderingModule(Method, L.LightningModule):
                 as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
-            direct_light: also read the direct light and the albedo of what mirrors and clear glass show, which the
+            direct_light: also read the direct light and the albedo of what metal and glass show, which the
                 renderer gives without noise (`Renderer.gbuffer`); with "demodulated", the output adds albedo times
                 direct light, so that the network predicts the rest. Only for methods that read the G-buffer; not in the
                 paper.
@@ -201,7 +201,7 @@ class RenderingModule(Method, L.LightningModule):
         return join_channels(maps)
 
     def albedo(self, batch: Batch) -> Tensor:
-        """Return the albedo (B, 3, H, W); with direct light, that of what mirrors and clear glass show, too."""
+        """Return the albedo (B, 3, H, W); with direct light, that of what metal and glass show, too."""
         return batch["albedo"] + batch["mirrored_albedo"] if self.hparams["direct_light"] else batch["albedo"]
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:

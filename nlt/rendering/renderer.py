@@ -150,8 +150,9 @@ class Renderer:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
             radiance seen directly from lamps and from the environment, as means over each pixel's area. If `direct`,
             also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps, as the
-            mean weighted by albedo; and mirrored_albedo (3, H, W), the mean albedo in mirrors and behind glass times
-            what they let pass. A lamp in a mirror is a white surface that reflects what it emits.
+            mean weighted by albedo; and mirrored_albedo (3, H, W), the mean albedo in metal and behind glass times
+            what they let pass. Rough metal shows another direction of its lobe in each place. A lamp in a mirror is a
+            white surface that reflects what it emits; lamps in rough metal are left out.
         """
         corners = np.floor(camera.centres()).astype(np.float32)
         lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
@@ -367,9 +368,10 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
 
     def step(k: Any, albedo: Any, mirrored: Any, reflected: Any, light: Any) -> tuple:
         first = trace(_hammersley(k, places))
-        surface, tint, bounces = _through_mirrors(scene, first, masks)
+        surface, tint, bounces, is_sharp = _through_mirrors(scene, first, masks, _hammersley(k, places))
         emission = _emission(scene, surface)
-        is_lamp = (bounces > 0) & dr.any(emission > 0)
+        # Rough metal blurs a lamp, but a few rays would show it as often, sharp and far too bright.
+        is_lamp = (bounces > 0) & is_sharp & dr.any(emission > 0)
         # Places on one side of the pixel see points on all sides of a lamp, or edges would be lit by one side only.
         direct = places * _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
         direct = dr.select(is_lamp, emission, direct)
@@ -420,29 +422,31 @@ def _hammersley(k: Any, count: int) -> Any:
     return mi.Point2f((mi.Float(k) + 0.5) / count, reversed_bits + 0.5 / count)
 
 
-def _through_mirrors(scene: Any, surface: Any, masks: bool) -> tuple[Any, Any, Any]:
-    """Follow the ray that hit `surface` on to the first that is no mirror or clear glass, through glass where possible.
+def _through_mirrors(scene: Any, surface: Any, masks: bool, lobe: Any) -> tuple[Any, Any, Any, Any]:
+    """Follow the ray that hit `surface` on to the first with a diffuse lobe, by metal and through glass.
 
-    It is followed by way of at most `_MOST_MIRRORS`.
+    It is followed by way of at most `_MOST_MIRRORS` surfaces. `lobe`, a point in the unit square, chooses a direction
+    from the lobes of those that are rough.
 
-    Returns the interaction there, the share of its radiance that reaches the camera, and the number of mirrors and
-    panes on the way.
+    Returns the interaction there, the share of its radiance that reaches the camera, the number of surfaces on the way,
+    and whether none of these is rough.
     """
 
-    def is_clear(surface: Any, tint: Any, bounces: Any) -> Any:
+    def reflects(surface: Any, tint: Any, bounces: Any, is_sharp: Any) -> Any:
         if not is_jit() and not surface.is_valid():
             return False  # A scalar ray that misses has no BSDF.
         flags = surface.bsdf().flags()
-        only_deltas = (flags != 0) & (flags & int(mi.BSDFFlags.Smooth) == 0)  # "Smooth" are all lobes but deltas.
-        return surface.is_valid() & only_deltas & (bounces < _MOST_MIRRORS)
+        is_specular = (flags != 0) & (flags & int(mi.BSDFFlags.Diffuse) == 0)
+        return surface.is_valid() & is_specular & (bounces < _MOST_MIRRORS)
 
-    def step(surface: Any, tint: Any, bounces: Any) -> tuple:
+    def step(surface: Any, tint: Any, bounces: Any, is_sharp: Any) -> tuple:
         # A dielectric reflects if the first number is below its reflectance.
-        sample, weight = surface.bsdf().sample(mi.BSDFContext(), surface, mi.Float(0.9999), mi.Point2f(0.5))
+        sample, weight = surface.bsdf().sample(mi.BSDFContext(), surface, mi.Float(0.9999), lobe)
         onward = surface.spawn_ray(surface.to_world(sample.wo))
-        return first_surface(scene, onward, masks), tint * mi.Color3f(weight), bounces + 1
+        is_sharp &= surface.bsdf().flags() & int(mi.BSDFFlags.Smooth) == 0  # "Smooth" are all lobes but deltas.
+        return first_surface(scene, onward, masks), tint * mi.Color3f(weight), bounces + 1, is_sharp
 
-    return dr.while_loop((surface, mi.Color3f(1), mi.UInt32(0)), is_clear, step)
+    return dr.while_loop((surface, mi.Color3f(1), mi.UInt32(0), mi.Bool(True)), reflects, step)
 
 
 def _transmits(scene: Any, masks: bool, position: Any, **camera: Any) -> tuple:

@@ -157,7 +157,7 @@ def material(bsdf: Any) -> str:
 
 
 def diffuse_albedo(bsdf: Any, interaction: Any, active: Any = True) -> Any:
-    """Return the diffuse reflectance in [0, 1]; it is zero for BSDFs without a diffuse lobe, like mirrors and glass.
+    """Return the diffuse reflectance in [0, 1]; it is zero for BSDFs without a diffuse lobe, like metal and glass.
 
     For those, Mitsuba's default returns the value of the BSDF, which can be 18 for a conductor.
     """

@@ -227,6 +227,31 @@ def test_direct_light_by_way_of(tmp_path, case):
     np.testing.assert_allclose(ours["direct"][:, lamp], np.array([LIGHT["radiance"]]).T.repeat(lamp.sum(), 1))
 
 
+def test_direct_light_by_way_of_rough_metal(tmp_path):
+    """Rough metal shows as much light of lit surfaces as Mitsuba's paths of that length, and no lamp."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    source, bsdf = tmp_path / "scene.xml", MIRROR.replace("conductor", "roughconductor")
+    bsdf = bsdf.replace("</bsdf>", '<float name="alpha" value="0.2"/></bsdf>')
+    source.write_text(source.read_text().replace("</scene>", PANE.format(x=1.0, bsdf=bsdf)))
+    up, target = np.array([0, 1.0, 0]), np.array([1.0, 0.9, -0.3])
+    camera = Camera.look_at(np.array([-0.9, 0.6, -0.7]), target, up, 60, 96, 96)
+    buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
+    pane = (buffers["albedo"] == 0).all(0) & (buffers["depth"][0] > 0)
+    ours = buffers["mirrored_albedo"] * buffers["direct"]
+    plain = mi.load_file(str(source), optimize=False)
+
+    def by_paths(depth):
+        integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
+        return np.array(mi.render(plain, sensor=sensor_of(camera, 1), integrator=integrator, spp=1024))[..., :3]
+
+    lamp_in_metal, surface_in_metal = by_paths(2) - by_paths(1), by_paths(3) - by_paths(2)
+    for rows, sees_lamp in ((slice(48, 72), True), (slice(72, 96), False)):
+        inside = pane[rows]
+        expected, lamp = (image[rows][inside].mean(0) for image in (surface_in_metal, lamp_in_metal))
+        assert inside.mean() > 0.5 and (lamp > 0.5 * expected).all() == sees_lamp
+        np.testing.assert_allclose(ours[:, rows][:, inside].mean(1), expected, rtol=0.2)
+
+
 @pytest.mark.parametrize("panes", [2, 3])
 def test_at_most_two_panes_are_looked_through(tmp_path, panes):
     """A lamp by way of more surfaces would be a dot as bright as the lamp, which almost no path sees."""
@@ -392,9 +417,9 @@ def test_emission_of_the_environment(tmp_path, sky):
 
 def test_noisy_images_have_the_references_expectation():
     """Over many samples, the residuals of all pixels have mean 0 and are uncorrelated."""
-    spec = DatasetSpec(["living_room"], resolution=8, test=120, num_points=1, num_photons=1, reference_spp=16)
+    spec = DatasetSpec(["living_room"], resolution=8, val=120, num_points=1, num_photons=1, reference_spp=16)
     render = SampleRenderer(spec, 0)
-    samples = [render.sample("test", k) for k in range(spec.test)]
+    samples = [render.sample("val", k) for k in range(spec.val)]
     images = {
         n: np.stack([s[n] for s in samples]).astype(float) for n in ("noisy", "noisy_input", "target", "reference_a")
     }
