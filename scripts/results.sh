@@ -56,11 +56,14 @@ if [ "$scale" = small ]; then
         guided_4spp_1_2@direct $peers path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
-        guided_1spp_relative@direct_corrected guided_1spp@other_rooms guided_1spp@direct_other_rooms \
-        guided_1spp@direct_corrected_other_rooms $peers
+        guided_1spp_relative@direct_corrected $peers
     once nlt stress --config front --data real_living_room_moving_lights --scale demo --out results/front_real \
         --suites light geometry materials camera frame flicker --methods cnn@direct guided_1spp guided_1spp@direct \
         guided_1spp@direct_corrected guided_1spp_relative@direct_corrected oidn_1 oidn_4
+    room --config front --scale demo --seeds 3 --out results/zero_shot \
+        --methods guided_1spp guided_1spp@direct_corrected guided_1spp_relative@direct_corrected guided_1spp@other_rooms \
+        guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
+        guided_1spp_relative@direct_corrected_other_rooms oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2
     once python scripts/teaser.py results/front_256 --view 8 \
         --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
