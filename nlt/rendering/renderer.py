@@ -152,7 +152,7 @@ class Renderer:
             also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps, as the
             mean weighted by albedo; and mirrored_albedo (3, H, W), the mean albedo in metal and behind glass times
             what they let pass. Rough metal shows another direction of its lobe in each place. A lamp in a mirror is a
-            white surface that reflects what it emits; lamps in rough metal are left out.
+            white surface that reflects what it emits; lamps and sky in rough metal are left out.
         """
         corners = np.floor(camera.centres()).astype(np.float32)
         lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
@@ -367,10 +367,11 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
     """
 
     def step(k: Any, albedo: Any, mirrored: Any, reflected: Any, light: Any) -> tuple:
-        first = trace(_hammersley(k, places))
-        surface, tint, bounces, is_sharp = _through_mirrors(scene, first, masks, _hammersley(k, places))
+        place = _hammersley(k, places)
+        first = trace(place)
+        surface, tint, bounces, is_sharp = _through_mirrors(scene, first, masks, place)
         emission = _emission(scene, surface)
-        # Rough metal blurs a lamp, but a few rays would show it as often, sharp and far too bright.
+        # Rough metal blurs a lamp. The few rays here would show sharp copies of it, far too bright.
         is_lamp = (bounces > 0) & is_sharp & dr.any(emission > 0)
         # Places on one side of the pixel see points on all sides of a lamp, or edges would be lit by one side only.
         direct = places * _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
@@ -423,10 +424,10 @@ def _hammersley(k: Any, count: int) -> Any:
 
 
 def _through_mirrors(scene: Any, surface: Any, masks: bool, lobe: Any) -> tuple[Any, Any, Any, Any]:
-    """Follow the ray that hit `surface` on to the first with a diffuse lobe, by metal and through glass.
+    """Follow the ray that hit `surface`, off metal and through glass, to the first surface with a diffuse lobe.
 
-    It is followed by way of at most `_MOST_MIRRORS` surfaces. `lobe`, a point in the unit square, chooses a direction
-    from the lobes of those that are rough.
+    At most `_MOST_MIRRORS` surfaces are on the way. `lobe`, a point in the unit square, chooses the direction in which
+    the rough ones reflect.
 
     Returns the interaction there, the share of its radiance that reaches the camera, the number of surfaces on the way,
     and whether none of these is rough.
@@ -441,9 +442,10 @@ def _through_mirrors(scene: Any, surface: Any, masks: bool, lobe: Any) -> tuple[
 
     def step(surface: Any, tint: Any, bounces: Any, is_sharp: Any) -> tuple:
         # A dielectric reflects if the first number is below its reflectance.
-        sample, weight = surface.bsdf().sample(mi.BSDFContext(), surface, mi.Float(0.9999), lobe)
+        bsdf = surface.bsdf()
+        sample, weight = bsdf.sample(mi.BSDFContext(), surface, mi.Float(0.9999), lobe)
         onward = surface.spawn_ray(surface.to_world(sample.wo))
-        is_sharp &= surface.bsdf().flags() & int(mi.BSDFFlags.Smooth) == 0  # "Smooth" are all lobes but deltas.
+        is_sharp &= bsdf.flags() & int(mi.BSDFFlags.Smooth) == 0  # "Smooth" are all lobes but deltas.
         return first_surface(scene, onward, masks), tint * mi.Color3f(weight), bounces + 1, is_sharp
 
     return dr.while_loop((surface, mi.Color3f(1), mi.UInt32(0), mi.Bool(True)), reflects, step)
