@@ -47,7 +47,7 @@ class OpenImageDenoise(PathTracing):
         Args:
             spp: samples per pixel.
             quality: OIDN's mode, from fastest to slowest.
-            mirrors: where metal or glass is seen, the albedo guide is the albedo of what it shows. A frame is
+            mirrors: the albedo guide is `seen_albedo`: where metal or glass is seen, of what it shows. A frame is
                 then charged for `Renderer.direct`, which also traces shadow rays that OIDN does not need.
         """
         super().__init__(spp)
@@ -58,7 +58,7 @@ class OpenImageDenoise(PathTracing):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return ("traced", "albedo", "normal", *(("mirrored_albedo",) if self._mirrors else ()))
+        return ("traced", "albedo", "normal", *(("seen_albedo",) if self._mirrors else ()))
 
     def steps(self) -> dict[str, Callable[[Batch, Any], Any]]:
         return {"denoise": self.denoise}
@@ -71,7 +71,7 @@ class OpenImageDenoise(PathTracing):
         import mitsuba_oidn as oidn
 
         exposure = batch["exposure"].view(-1, 1, 1, 1)
-        albedo = batch["albedo"] + batch["mirrored_albedo"] if self._mirrors else batch["albedo"]
+        albedo = batch["seen_albedo" if self._mirrors else "albedo"]
         images = (batch["traced"] * exposure, albedo, batch["normal"])
         channels_last = [image.permute(0, 2, 3, 1).float().contiguous() for image in images]
         options = {"hdr": True, "clean_aux": True, "quality": oidn.Quality[self._quality.capitalize()]}

@@ -71,14 +71,15 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "radiance that a white diffuse surface there, or seen in metal or through glass, would reflect of "
-        "direct light; the pixel's mean weighted by albedo, noise-free",
+        "what a white diffuse surface there, or seen in metal or through glass, would reflect of direct light; "
+        "times seen_albedo, the pixel mean of what is reflected; noise-free",
     ),
-    "mirrored_albedo": Field(
+    "seen_albedo": Field(
         (3, "H", "W"),
         "float16",
         "1",
-        "pixel mean of the albedo seen in metal or through glass, times what these let pass; elsewhere 0",
+        "pixel mean of the diffuse reflectance towards the camera, of the surface or of what metal and glass show, "
+        "times what these let pass; less than albedo under a coat",
     ),
     "camera_matrix": Field((3, 3), "float32", "px", "K, maps view space to pixels"),
     "world_to_view": Field((4, 4), "float32", "m", "T, maps world space to view space; a rigid transform"),
@@ -93,7 +94,7 @@ FIELDS: dict[str, Field] = {
 
 TRACED = ("noisy", "noisy_input")  # fields that path tracing gives and a method may read
 BUFFERS = ("depth", "normal", "albedo", "emission")  # fields that one noise-free pass of primary rays gives
-DIRECT = ("direct", "mirrored_albedo")  # fields that shadow rays give
+DIRECT = ("direct", "seen_albedo")  # fields that shadow rays give
 
 POINT_FIELDS: dict[str, Field] = {
     "position": Field(("N", 3), "float32", "m", "position with every object at its place in the scene file"),

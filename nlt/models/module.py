@@ -102,10 +102,10 @@ class RenderingModule(Method, L.LightningModule):
                 as input predicts radiance either way.
             add_emission: with "demodulated", add the radiance that the camera sees directly from lamps and sky, which
                 the renderer knows exactly.
-            direct_light: also read the direct light and the albedo of what metal and glass show, which the
-                renderer gives without noise (`Renderer.gbuffer`); with "demodulated", the output adds albedo times
-                direct light, so that the network predicts the rest. Only for methods that read the G-buffer; not in the
-                paper.
+            direct_light: also read the direct light and the seen albedo, in metal and glass and under a coat, which
+                the renderer gives without noise (`Renderer.gbuffer`); with "demodulated", the output adds seen albedo
+                times direct light, so that the network predicts the rest. Only for methods that read the G-buffer; not
+                in the paper.
             cleaner_target: train towards the `target` image of 16 spp instead of the paper's `noisy` image of 1 spp.
             loss: name of a function in nlt.models.losses.
             optimizer: "adam" is the paper's. "muon" orthogonalises the steps of all weights but the last layer's, the
@@ -197,12 +197,13 @@ class RenderingModule(Method, L.LightningModule):
         """Return the maps of `GBUFFER` and, if chosen, of direct light (B, 10 or 16, H, W)."""
         maps = [batch[name] for name in GBUFFER]
         if self.hparams["direct_light"]:
-            maps += [log_exposed(batch["direct"], self.exposure(batch)), batch["mirrored_albedo"]]
+            mirrors_and_coats = batch["seen_albedo"] - batch["albedo"]
+            maps += [log_exposed(batch["direct"], self.exposure(batch)), mirrors_and_coats]
         return join_channels(maps)
 
     def albedo(self, batch: Batch) -> Tensor:
-        """Return the albedo (B, 3, H, W); with direct light, that of what metal and glass show, too."""
-        return batch["albedo"] + batch["mirrored_albedo"] if self.hparams["direct_light"] else batch["albedo"]
+        """Return the albedo (B, 3, H, W); with direct light, the seen one: in metal and glass, and under a coat."""
+        return batch["seen_albedo" if self.hparams["direct_light"] else "albedo"]
 
     def synthesize(self, batch: Batch, features: Features) -> Tensor:
         """Run the U-Net on the features and return linear radiance (B, 3, H, W)."""

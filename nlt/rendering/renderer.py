@@ -149,10 +149,11 @@ class Renderer:
         Returns:
             depth (1, H, W) and shading normal (3, H, W) at pixel centres; albedo (3, H, W) and emission (3, H, W), the
             radiance seen directly from lamps and from the environment, as means over each pixel's area. If `direct`,
-            also direct (3, H, W), the radiance that a white diffuse surface there would reflect of the lamps, as the
-            mean weighted by albedo; and mirrored_albedo (3, H, W), the mean albedo in metal and behind glass times
-            what they let pass. Rough metal shows another direction of its lobe in each place. A lamp in a mirror is a
-            white surface that reflects what it emits; lamps and sky in rough metal are left out.
+            also seen_albedo (3, H, W), the mean share of light that is reflected to the camera, there or by what metal
+            and glass show, which is less than the albedo under a coat; and direct (3, H, W), which times seen_albedo is
+            the mean of what is reflected of the lamps; where nothing is, what white would reflect. Rough metal shows
+            another direction of its lobe in each place. A lamp in a mirror is a white surface that reflects what it
+            emits; lamps and sky in rough metal are left out.
         """
         corners = np.floor(camera.centres()).astype(np.float32)
         lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
@@ -171,7 +172,7 @@ class Renderer:
         buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(valid[:, None], normal, 0)}
         buffers |= {"albedo": albedo, "emission": emission}
         if direct:
-            buffers["direct"], buffers["mirrored_albedo"] = light
+            buffers["direct"], buffers["seen_albedo"] = light
         return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
     def _may_see_lamp(self, camera: Camera) -> np.ndarray:
@@ -329,6 +330,25 @@ def _albedo(interaction: Any) -> Any:
     return diffuse_albedo(interaction.bsdf(), interaction, valid) if _any(valid) else mi.Color3f(0)
 
 
+def _seen_albedo(interaction: Any) -> Any:
+    """Return the share of light from along the normal that the diffuse lobe reflects to the camera.
+
+    Under a coat it is less than the albedo, in plastic half as much if the base is dark.
+    """
+    valid = interaction.is_valid()
+    if not _any(valid):
+        return mi.Color3f(0)
+    normal = mi.Vector3f(0, 0, dr.sign(interaction.wi.z))
+    return dr.minimum(dr.pi * _diffuse_lobe(interaction, normal), _albedo(interaction))  # no highlight
+
+
+def _diffuse_lobe(interaction: Any, direction: Any) -> Any:
+    """Return the diffuse lobe's value times the cosine; of `principled`, which has no parts, the whole BSDF's."""
+    diffuse = mi.BSDFContext()
+    diffuse.type_mask = mi.BSDFFlags.Diffuse
+    return mi.Color3f(interaction.bsdf().eval(diffuse, interaction, direction, interaction.is_valid()))
+
+
 def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
     """Return two masks: pixels at an edge or in a texture, and pixels from which a ray escapes.
 
@@ -361,12 +381,12 @@ def _pixel_mean(trace: Callable, value: Callable, place: Callable, count: int, a
 
 
 def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
-    """Return the albedo, the direct light that it reflects, and the albedo in mirrors: means over places in each pixel.
+    """Return the albedo, the direct light, and the seen albedo: means over places in each pixel.
 
-    The direct light is weighted by albedo. So their product is the pixel's radiance where surfaces meet, too.
+    The direct light is weighted by seen albedo. So their product is the pixel's radiance where surfaces meet, too.
     """
 
-    def step(k: Any, albedo: Any, mirrored: Any, reflected: Any, light: Any) -> tuple:
+    def step(k: Any, albedo: Any, seen: Any, reflected: Any, light: Any) -> tuple:
         place = _hammersley(k, places)
         first = trace(place)
         surface, tint, bounces, is_sharp = _through_mirrors(scene, first, masks, place)
@@ -374,25 +394,27 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
         # Rough metal blurs a lamp. The few rays here would show sharp copies of it, far too bright.
         is_lamp = (bounces > 0) & is_sharp & dr.any(emission > 0)
         # Places on one side of the pixel see points on all sides of a lamp, or edges would be lit by one side only.
-        direct = places * _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
-        direct = dr.select(is_lamp, emission, direct)
-        own = _albedo(first)
-        seen = dr.select(bounces > 0, tint * dr.select(is_lamp, 1, _albedo(surface)), 0)
-        return k + 1, albedo + own, mirrored + seen, reflected + (own + seen) * direct, light + direct
+        lit, white = _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
+        lit, white = (dr.select(is_lamp, emission, places * part) for part in (lit, white))
+        own = tint * dr.select(is_lamp, 1, _seen_albedo(surface))
+        return k + 1, albedo + _albedo(first), seen + own, reflected + tint * lit, light + white
 
     black = mi.Color3f(0)
     start = (mi.UInt32(0), black, black, black, black)
-    _, albedo, mirrored, reflected, light = dr.while_loop(start, lambda k, *_: k < places, step)
-    weight = albedo + mirrored
-    direct = dr.select(weight > 0, reflected / dr.maximum(weight, 1e-9), light / places)
-    return albedo / places, direct, mirrored / places
+    _, albedo, seen, reflected, light = dr.while_loop(start, lambda k, *_: k < places, step)
+    direct = dr.select(seen > 0, reflected / dr.maximum(seen, 1e-9), light / places)
+    return albedo / places, direct, seen / places
 
 
-def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface: Any) -> Any:
-    """Return the part of what a white diffuse surface reflects that every `stride`-th of `rays` shadow rays finds."""
+def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface: Any) -> tuple[Any, Any]:
+    """Return the part of the reflected light that every `stride`-th of `rays` shadow rays finds.
+
+    First what the diffuse lobe of `surface` reflects towards the camera, second what a white surface would reflect.
+    """
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
+    albedo = _albedo(surface)
 
-    def step(k: Any, total: Any) -> tuple:
+    def step(k: Any, lit: Any, white: Any) -> tuple:
         # The first coordinate also chooses the emitter, and the triangle of a mesh.
         place = _hammersley(k, rays)
         lamp, radiance = scene.sample_emitter_direction(surface, place, not masks, surface.is_valid())
@@ -404,11 +426,13 @@ def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface
         is_area = mi.has_flag(lamp.emitter.flags(), mi.EmitterFlags.Surface)
         parts = dr.pi * rays * lamp.pdf  # so many would cover all above the surface
         radiance = dr.select(is_area, radiance * parts / (1 + parts), radiance)
-        return k + stride, total + mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0)
+        received = mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0) / dr.pi
+        value = _diffuse_lobe(surface, surface.to_local(lamp.d)) * radiance
+        return k + stride, lit + dr.minimum(value, albedo * received), white + received  # no highlight
 
-    state = (mi.UInt32(first), mi.Color3f(0))
-    _, total = dr.while_loop(state, lambda k, total: surface.is_valid() & (k < rays), step)
-    return total / (rays * dr.pi)
+    state = (mi.UInt32(first), mi.Color3f(0), mi.Color3f(0))
+    _, lit, white = dr.while_loop(state, lambda k, *_: surface.is_valid() & (k < rays), step)
+    return lit / rays, white / rays
 
 
 def _grid(k: Any, count: int) -> Any:

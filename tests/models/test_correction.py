@@ -98,7 +98,7 @@ def test_a_denoiser_in_a_strange_light(gap, direct_light):
     batch = synthetic_batch(size=64)
     batch["emission"].zero_()
     batch["emission"][:, :, :4, :4] = 1e4
-    light = 40 * (batch["albedo"] + (batch["mirrored_albedo"] if direct_light else 0) + LEAST_ALBEDO)
+    light = 40 * (batch["seen_albedo" if direct_light else "albedo"] + LEAST_ALBEDO)
     batch["noisy"] = light * (0.5 + torch.rand(light.shape)) + batch["emission"]
     torch.manual_seed(0)
     settings = {"width": 4, "depth": 1, "output": "demodulated", "gap": gap, "direct_light": direct_light}

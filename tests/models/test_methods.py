@@ -147,7 +147,7 @@ def test_direct_light(config):
     """A switch of every method that reads the G-buffer: six more channels, no more stages."""
     batch, without = synthetic_batch(), build(config)
     method = build(config, find_config("variant", "direct")).eval()
-    assert {*method.inputs} - {*without.inputs} == {"direct", "mirrored_albedo"}
+    assert {*method.inputs} - {*without.inputs} == {"direct", "seen_albedo"}
     assert method.stages == without.stages and method.reads_direct_light > without.reads_direct_light
     assert method.feature_channels == without.feature_channels + 6
     with torch.no_grad():
@@ -489,7 +489,7 @@ def test_oidn_sees_what_a_mirror_shows():
     albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 4 + torch.arange(64) // 4) % 2)).expand(1, 3, 64, 64)
     batch = {
         "traced": albedo * torch.rand(1, 3, 64, 64, generator=generator) * 2, "albedo": torch.zeros(1, 3, 64, 64),
-        "mirrored_albedo": albedo, "exposure": torch.tensor([0.5]), "normal": torch.ones(1, 3, 64, 64) / 3**0.5,
+        "seen_albedo": albedo, "exposure": torch.tensor([0.5]), "normal": torch.ones(1, 3, 64, 64) / 3**0.5,
     }  # fmt: skip
     plain, mirrors = [
         (build_if_untrained(name)(batch) - albedo).square().mean() for name in ("oidn_1", "oidn_1_mirrors")
@@ -504,7 +504,7 @@ def test_oidn_removes_noise_and_keeps_edges_of_its_guides(name):
     albedo = (0.3 + 0.5 * ((torch.arange(64)[:, None] // 8 + torch.arange(64) // 8) % 2)).expand(1, 3, 64, 64)
     noise = torch.rand(1, 3, 64, 64, generator=generator) * 2
     batch = {
-        "traced": albedo * noise, "albedo": albedo, "mirrored_albedo": torch.zeros(1, 3, 64, 64),
+        "traced": albedo * noise, "albedo": albedo, "seen_albedo": albedo,
         "exposure": torch.tensor([0.5]),
         "normal": torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 64, 64),
     }  # fmt: skip

@@ -111,9 +111,8 @@ def test_a_demodulated_output():
     assert dark.fields == dark.inputs and not dark(batch).isnan().any()
     direct = CNN(width=4, output="demodulated", direct_light=True)
     direct.unet.forward = lambda *_: channels
-    mirrored = batch["mirrored_albedo"]
-    expected += mirrored * channels[:, :3] / batch["exposure"].view(-1, 1, 1, 1)
-    torch.testing.assert_close(direct(batch), expected + (batch["albedo"] + mirrored) * batch["direct"])
+    expected += (batch["seen_albedo"] - batch["albedo"]) * channels[:, :3] / batch["exposure"].view(-1, 1, 1, 1)
+    torch.testing.assert_close(direct(batch), expected + batch["seen_albedo"] * batch["direct"])
 
 
 def test_a_method_without_albedo_predicts_radiance():

@@ -157,6 +157,44 @@ def test_direct_light_next_to_the_lamp(tmp_path, monkeypatch):
     assert 0.5 < share.max() < 1.2
 
 
+def test_direct_light_under_a_coat(tmp_path):
+    """Plastic reflects less than its albedo says: as much as Mitsuba's paths of that length, but for its highlight."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    source = tmp_path / "scene.xml"
+    camera = Camera.look_at(np.array([0.9, 0.8, -0.6]), np.array([0.1, 0, 0.0]), np.array([0, 1.0, 0]), 60, 48, 48)
+    plain = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
+    diffuse = '"diffuse"><rgb name="reflectance" value="0.7, 0.6, 0.5"/>'
+    coated = '"plastic"><boolean name="nonlinear" value="true"/><rgb name="diffuse_reflectance" value="0.7, 0.6, 0.5"/>'
+    source.write_text(source.read_text().replace(diffuse, coated, 1))
+    buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
+    scene = mi.load_file(str(source), optimize=False)
+    render = lambda depth: mi.render(
+        scene, sensor=sensor_of(camera), integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=2048
+    )
+    expected = np.moveaxis(np.array(render(2) - render(1))[..., :3], 2, 0)
+    ours = buffers["seen_albedo"] * buffers["direct"]
+
+    (x, y, z), (width, depth) = camera.position, LIGHT["size"]
+    dx, dy, dz = camera.view_directions().astype(float)
+    down = -(y + LIGHT["height"]) / np.where(dy < 0, dy, np.nan)  # to the lamp's mirror image in the floor
+    is_highlight = (np.abs(x + down * dx) < width / 2 + 0.1) & (np.abs(z + down * dz) < depth / 2 + 0.1)
+    is_floor = (buffers["normal"][1] > 0.99) & (buffers["depth"][0] > 0) & (buffers["emission"] == 0).all(0)
+    is_floor &= np.abs(surface(camera, buffers)[0][:, 1].reshape(48, 48)) < 1e-3
+    lit = ndimage.binary_erosion(is_floor & ~is_highlight & (expected > 0.01).all(0))
+    assert lit.sum() > 400
+    np.testing.assert_allclose(buffers["albedo"], plain["albedo"], atol=1e-6)
+    ours, expected, as_plain = ours[:, lit], expected[:, lit], (plain["albedo"] * plain["direct"])[:, lit]
+    np.testing.assert_allclose(ours.mean(1), expected.mean(1), rtol=0.02)
+    assert np.median(np.abs(ours / expected - 1)) < 0.02
+    assert (ours < 0.8 * as_plain).all(), "a plain surface would be far brighter"
+    # Fresnel's law for an index of 1.49, and 0.5918 of the light inside is reflected back.
+    cosine, inside = -dy[lit], np.sqrt(1 - (1 - dy[lit] ** 2) / 1.49**2)
+    ratios = (cosine - 1.49 * inside) / (cosine + 1.49 * inside), (1.49 * cosine - inside) / (1.49 * cosine + inside)
+    passed = (1 - np.mean(np.square(ratios), axis=0)) * (1 - (0.49 / 2.49) ** 2) / 1.49**2
+    base = np.array([[0.7], [0.6], [0.5]])
+    np.testing.assert_allclose(buffers["seen_albedo"][:, lit], base * passed / (1 - 0.5918 * base), rtol=0.02)
+
+
 def test_direct_light_of_the_sky(tmp_path):
     """A white floor under a sky of one colour reflects nearly that colour, and nothing in the dark."""
     source = tmp_path / "scene.xml"
@@ -213,7 +251,7 @@ def test_direct_light_by_way_of(tmp_path, case):
     albedo = np.array([[0.7], [0.6], [0.5]])
     is_surface = np.isclose(theirs["albedo"], albedo[:, None]).all(0) & (theirs["emission"] == 0).all(0)
     diffuse = inside(pane & is_surface[:, columns])
-    assert lamp.sum() > 3 and diffuse.sum() > 100 and not theirs["mirrored_albedo"].any()
+    assert lamp.sum() > 3 and diffuse.sum() > 100 and np.allclose(theirs["seen_albedo"], theirs["albedo"], atol=1e-6)
     image = theirs["direct"][:, :, columns]
     agrees = np.isclose(ours["direct"], image, rtol=1e-2, atol=1e-4).all(0)
     _, seen = lit_by_lamp(*surface(there, theirs))
@@ -222,8 +260,8 @@ def test_direct_light_by_way_of(tmp_path, case):
     one_ray = image.max() / 8
     assert np.isclose(ours["direct"], image, rtol=1e-2, atol=one_ray).all(0)[diffuse].mean() > 0.99
     expected = (tint * albedo).repeat(diffuse.sum(), 1)
-    np.testing.assert_allclose(ours["mirrored_albedo"][:, diffuse], expected, rtol=1e-2)
-    np.testing.assert_allclose(ours["mirrored_albedo"][:, lamp], tint.repeat(lamp.sum(), 1), rtol=1e-2)
+    np.testing.assert_allclose(ours["seen_albedo"][:, diffuse], expected, rtol=1e-2)
+    np.testing.assert_allclose(ours["seen_albedo"][:, lamp], tint.repeat(lamp.sum(), 1), rtol=1e-2)
     np.testing.assert_allclose(ours["direct"][:, lamp], np.array([LIGHT["radiance"]]).T.repeat(lamp.sum(), 1))
 
 
@@ -237,7 +275,7 @@ def test_direct_light_by_way_of_rough_metal(tmp_path):
     camera = Camera.look_at(np.array([-0.9, 0.6, -0.7]), target, up, 60, 96, 96)
     buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     pane = (buffers["albedo"] == 0).all(0) & (buffers["depth"][0] > 0)
-    ours = buffers["mirrored_albedo"] * buffers["direct"]
+    ours = buffers["seen_albedo"] * buffers["direct"]
     plain = mi.load_file(str(source), optimize=False)
 
     def by_paths(depth):
@@ -264,7 +302,7 @@ def test_at_most_two_panes_are_looked_through(tmp_path, panes):
     buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     behind = (buffers["albedo"] == 0).all(0)
     assert behind.mean() > 0.5
-    assert buffers["mirrored_albedo"][:, behind].any() == (panes == 2)
+    assert buffers["seen_albedo"][:, behind].any() == (panes == 2)
 
 
 # ---- G-buffer -------------------------------------------------------------------------------------------
