@@ -47,10 +47,6 @@ if [ "$scale" = small ]; then
     once nlt compare --config front --data demo --scale medium --seeds 3 --workers "${WORKERS:-2}" \
         --out results/front_builtin_256 \
         --methods $front
-    room --config front --scale medium --out results/front_living_room_256 \
-        --methods cnn feature_projection nlt nlt_photons photons_only guided_1_16 guided_1_4 guided_1spp_1_16 \
-        guided_1spp_1_16@thin guided_1spp_1_4 guided_1spp_1_4@thin guided_1spp_1_2@thin guided_1spp guided_1spp@thin guided_1spp@other_rooms \
-        oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4
     room --config front --scale medium --seeds 3 --out results/front_256 \
         --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_16@direct_narrow guided_4spp@direct \
         guided_4spp_1_2@direct $peers path_tracing_1 path_tracing_4
@@ -110,8 +106,6 @@ if [ "$scale" = small ]; then
         --methods cnn cnn@before cnn@images_6400 nlt_photons nlt_photons@before photons_only@images_6400 oidn_1 oidn_4
     room --config table2_real_demodulated --scale small_6400 --out results/real_living_room_6400 \
         --methods $table2 cnn@before nlt_photons@before guided_1spp guided_1spp_field photons_only field photon_field
-    room --config front --scale any_room --out results/any_room \
-        --methods guided_1spp@any_room oidn_1_fast oidn_1_balanced oidn_1 path_tracing_1
     once python benchmarks/selection.py --minutes 4
 fi
 for report in results/*/report.html; do  # small enough for git

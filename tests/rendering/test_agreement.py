@@ -427,7 +427,7 @@ def test_emission_is_the_path_tracers_without_bounces(demo, experiment):
     assert not renderer.gbuffer(below)["emission"].any()
     views = [sample_view(demo, 10, np.random.default_rng(k)) for k in range(8)]
     culled = [renderer.gbuffer(view)["emission"] for view in views]
-    renderer._may_see_lamp = lambda camera: np.ones(camera.width * camera.height, bool)
+    renderer._gbuffer._may_see_lamp = lambda camera: np.ones(camera.width * camera.height, bool)
     assert np.array_equal(culled, [renderer.gbuffer(view)["emission"] for view in views])
     assert np.any(culled)
 

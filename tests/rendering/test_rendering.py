@@ -16,6 +16,7 @@ from scipy import ndimage, stats
 from nlt.baselines.cnn import CNN
 from nlt.data.sample import DIRECT
 from nlt.errors import UserError
+from nlt.rendering import photons as photons_module
 from nlt.rendering import renderer as renderer_module
 from nlt.rendering import variant as variant_module
 from nlt.rendering.renderer import Renderer
@@ -444,7 +445,7 @@ def test_photon_flux_is_unbiased(open_room, monkeypatch):
     share = power[0] / (np.pi * np.prod(LIGHT["size"]) * LIGHT["radiance"][0])
     assert 0.1 < share < 0.4
     for most in (1024, 3):
-        monkeypatch.setattr(renderer_module, "_MOST_CASTS", most)
+        monkeypatch.setattr(photons_module, "_MOST_CASTS", most)
         draws = [renderer.photons(4, seed) for seed in range(400)]
         sums = np.array([draw["photon_flux"][:, 0].sum(dtype=float) for draw in draws])
         assert stats.ttest_1samp(sums, power[0]).pvalue > 1e-3
