@@ -29,11 +29,12 @@ from nlt.models.projection import visible_pixels
 from nlt.models.transport import PointEmbedding
 from nlt.paths import CONFIGS
 from nlt.report.page import write_page
+from nlt.stress.breaking import Stressed, breaking_point
 from nlt.stress.changed_scene import MESHES, ChangedScene
 from nlt.stress.inputs import INPUTS
 from nlt.stress.perturber import PLACES, ViewPerturber
 from nlt.stress.rendering import view_sets
-from nlt.stress.report import Stressed, breaking_point, stress_section
+from nlt.stress.report import stress_section
 from nlt.stress.suites import FLICKER, PATHS, ROWS, STEADY, load_suites
 from nlt.stress.views import nearest_embeddings
 
