@@ -25,6 +25,8 @@ _SHADOW_RAYS = 16  # of a pixel to each emitter; of a fine pixel one from each p
 # A ray is followed from a mirror, and through a thin pane or both sides of a thick one. Through more, as in a wine
 # glass, one of a pixel's few rays may find a lamp that almost no path finds, and the pixel becomes a bright dot.
 _MOST_MIRRORS = 2
+_BRIGHTEST = 4  # of a highlight, in white surfaces; a sharper one would show the shadow rays' points one by one
+_DARK = 0.01  # seen albedo below which the direct light over it is held down
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
@@ -134,14 +136,14 @@ def _seen_albedo(interaction: Any) -> Any:
     if not _any(valid):
         return mi.Color3f(0)
     normal = mi.Vector3f(0, 0, dr.sign(interaction.wi.z))
-    return dr.minimum(dr.pi * _diffuse_lobe(interaction, normal), _albedo(interaction))  # no highlight
+    return dr.minimum(dr.pi * _lobes(interaction, normal, mi.BSDFFlags.Diffuse), _albedo(interaction))  # no highlight
 
 
-def _diffuse_lobe(interaction: Any, direction: Any) -> Any:
-    """Return the diffuse lobe's value times the cosine; of `principled`, which has no parts, the whole BSDF's."""
-    diffuse = mi.BSDFContext()
-    diffuse.type_mask = mi.BSDFFlags.Diffuse
-    return mi.Color3f(interaction.bsdf().eval(diffuse, interaction, direction, interaction.is_valid()))
+def _lobes(interaction: Any, direction: Any, kinds: Any) -> Any:
+    """Return the value of the lobes of some kinds, times the cosine; of `principled`, which has no parts, of all."""
+    context = mi.BSDFContext()
+    context.type_mask = int(kinds)
+    return mi.Color3f(interaction.bsdf().eval(context, interaction, direction, interaction.is_valid()))
 
 
 def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
@@ -197,14 +199,14 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
     black = mi.Color3f(0)
     start = (mi.UInt32(0), black, black, black, black)
     _, albedo, seen, reflected, light = dr.while_loop(start, lambda k, *_: k < places, step)
-    direct = dr.select(seen > 0, reflected / dr.maximum(seen, 1e-9), light / places)
+    direct = dr.select(seen > 0, reflected / dr.maximum(seen, places * _DARK), light / places)
     return albedo / places, direct, seen / places
 
 
 def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface: Any) -> tuple[Any, Any]:
     """Return the part of the reflected light that every `stride`-th of `rays` shadow rays finds.
 
-    First what the diffuse lobe of `surface` reflects towards the camera, second what a white surface would reflect.
+    First what `surface` reflects towards the camera, diffusely and as a highlight, second what a white surface would.
     """
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
     albedo = _albedo(surface)
@@ -222,8 +224,8 @@ def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface
         parts = dr.pi * rays * lamp.pdf  # so many would cover all above the surface
         radiance = dr.select(is_area, radiance * parts / (1 + parts), radiance)
         received = mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0) / dr.pi
-        value = _diffuse_lobe(surface, surface.to_local(lamp.d)) * radiance
-        return k + stride, lit + dr.minimum(value, albedo * received), white + received  # no highlight
+        value = _lobes(surface, surface.to_local(lamp.d), mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy) * radiance
+        return k + stride, lit + dr.minimum(value, (albedo + _BRIGHTEST) * received), white + received
 
     state = (mi.UInt32(first), mi.Color3f(0), mi.Color3f(0))
     _, lit, white = dr.while_loop(state, lambda k, *_: surface.is_valid() & (k < rays), step)

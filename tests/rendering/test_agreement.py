@@ -195,6 +195,37 @@ def test_direct_light_under_a_coat(tmp_path):
     np.testing.assert_allclose(buffers["seen_albedo"][:, lit], base * passed / (1 - 0.5918 * base), rtol=0.02)
 
 
+@pytest.mark.parametrize("alpha", [0.2, 0.01])
+def test_highlights_of_a_rough_coat(tmp_path, alpha):
+    """A lamp's highlight on rough plastic is that of Mitsuba's paths of that length; a sharp one is held down."""
+    description = load_description(str(write_room(tmp_path, is_open=True)))
+    source = tmp_path / "scene.xml"
+    camera = Camera.look_at(np.array([0.9, 0.8, -0.6]), np.array([0.1, 0, 0.0]), np.array([0, 1.0, 0]), 60, 48, 48)
+    white = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)["direct"]
+    diffuse = '"diffuse"><rgb name="reflectance" value="0.7, 0.6, 0.5"/>'
+    coated = f'"roughplastic"><float name="alpha" value="{alpha}"/><rgb name="diffuse_reflectance" value="0.1"/>'
+    source.write_text(source.read_text().replace(diffuse, coated, 1))
+    buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
+    scene = mi.load_file(str(source), optimize=False)
+    render = lambda depth: mi.render(
+        scene, sensor=sensor_of(camera), integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=2048
+    )
+    expected = np.moveaxis(np.array(render(2) - render(1))[..., :3], 2, 0)
+    is_floor = (np.abs(surface(camera, buffers)[0][:, 1].reshape(48, 48)) < 1e-3) & (buffers["depth"][0] > 0)
+    floor = ndimage.binary_erosion(is_floor & (expected > 0.001).all(0))
+    ours, expected, base = (
+        image[:, floor]
+        for image in (buffers["seen_albedo"] * buffers["direct"], expected, buffers["seen_albedo"] * white)
+    )
+    assert floor.sum() > 400 and (expected > 2 * base).mean() > 0.02, "there is a highlight"
+    if alpha == 0.2:
+        np.testing.assert_allclose(ours.mean(1), expected.mean(1), rtol=0.03)
+        assert np.median(np.abs(ours / expected - 1)) < 0.03
+    else:
+        assert (base.mean(1) < ours.mean(1)).all() and (ours.mean(1) < expected.mean(1)).all()
+        assert ours.max() < expected.max() / 2
+
+
 def test_direct_light_of_the_sky(tmp_path):
     """A white floor under a sky of one colour reflects nearly that colour, and nothing in the dark."""
     source = tmp_path / "scene.xml"
