@@ -71,8 +71,8 @@ FIELDS: dict[str, Field] = {
         (3, "H", "W"),
         "float32",
         _RADIANCE,
-        "what a white diffuse surface there, or seen in metal or through glass, would reflect of direct light; "
-        "times seen_albedo, the pixel mean of what is reflected; noise-free",
+        "what the surface, or what metal and glass show, reflects of direct light, over seen_albedo: without a coat, "
+        "what a white diffuse surface would; with a rough coat, its highlights, too; noise-free",
     ),
     "seen_albedo": Field(
         (3, "H", "W"),
