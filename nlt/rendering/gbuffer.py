@@ -180,7 +180,8 @@ def _pixel_mean(trace: Callable, value: Callable, place: Callable, count: int, a
 def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
     """Return the albedo, the direct light, and the seen albedo: means over places in each pixel.
 
-    The direct light is weighted by seen albedo. So their product is the pixel's radiance where surfaces meet, too.
+    The direct light is weighted by seen albedo. So their product is the pixel's radiance where surfaces meet, too,
+    unless the pixel is almost black (`_DARK`).
     """
 
     def step(k: Any, albedo: Any, seen: Any, reflected: Any, light: Any) -> tuple:

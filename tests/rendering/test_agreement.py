@@ -157,21 +157,29 @@ def test_direct_light_next_to_the_lamp(tmp_path, monkeypatch):
     assert 0.5 < share.max() < 1.2
 
 
-def test_direct_light_under_a_coat(tmp_path):
-    """Plastic reflects less than its albedo says: as much as Mitsuba's paths of that length, but for its highlight."""
+def coated_floor(tmp_path, coated):
+    """Coat a room's floor and return a camera, the G-buffers before and after, and the direct light that Mitsuba sees.
+
+    The last one, (3, 48, 48), is what the coated room reflects of its lamp on Mitsuba's paths of that length.
+    """
     description = load_description(str(write_room(tmp_path, is_open=True)))
     source = tmp_path / "scene.xml"
     camera = Camera.look_at(np.array([0.9, 0.8, -0.6]), np.array([0.1, 0, 0.0]), np.array([0, 1.0, 0]), 60, 48, 48)
     plain = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     diffuse = '"diffuse"><rgb name="reflectance" value="0.7, 0.6, 0.5"/>'
-    coated = '"plastic"><boolean name="nonlinear" value="true"/><rgb name="diffuse_reflectance" value="0.7, 0.6, 0.5"/>'
     source.write_text(source.read_text().replace(diffuse, coated, 1))
     buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     scene = mi.load_file(str(source), optimize=False)
     render = lambda depth: mi.render(
         scene, sensor=sensor_of(camera), integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=2048
     )
-    expected = np.moveaxis(np.array(render(2) - render(1))[..., :3], 2, 0)
+    return camera, plain, buffers, np.moveaxis(np.array(render(2) - render(1))[..., :3], 2, 0)
+
+
+def test_direct_light_under_a_coat(tmp_path):
+    """Plastic reflects less than its albedo says: as much as Mitsuba's paths of that length, but for its highlight."""
+    coated = '"plastic"><boolean name="nonlinear" value="true"/><rgb name="diffuse_reflectance" value="0.7, 0.6, 0.5"/>'
+    camera, plain, buffers, expected = coated_floor(tmp_path, coated)
     ours = buffers["seen_albedo"] * buffers["direct"]
 
     (x, y, z), (width, depth) = camera.position, LIGHT["size"]
@@ -198,24 +206,13 @@ def test_direct_light_under_a_coat(tmp_path):
 @pytest.mark.parametrize("alpha", [0.2, 0.01])
 def test_highlights_of_a_rough_coat(tmp_path, alpha):
     """A lamp's highlight on rough plastic is that of Mitsuba's paths of that length; a sharp one is held down."""
-    description = load_description(str(write_room(tmp_path, is_open=True)))
-    source = tmp_path / "scene.xml"
-    camera = Camera.look_at(np.array([0.9, 0.8, -0.6]), np.array([0.1, 0, 0.0]), np.array([0, 1.0, 0]), 60, 48, 48)
-    white = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)["direct"]
-    diffuse = '"diffuse"><rgb name="reflectance" value="0.7, 0.6, 0.5"/>'
     coated = f'"roughplastic"><float name="alpha" value="{alpha}"/><rgb name="diffuse_reflectance" value="0.1"/>'
-    source.write_text(source.read_text().replace(diffuse, coated, 1))
-    buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
-    scene = mi.load_file(str(source), optimize=False)
-    render = lambda depth: mi.render(
-        scene, sensor=sensor_of(camera), integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=2048
-    )
-    expected = np.moveaxis(np.array(render(2) - render(1))[..., :3], 2, 0)
+    camera, plain, buffers, expected = coated_floor(tmp_path, coated)
     is_floor = (np.abs(surface(camera, buffers)[0][:, 1].reshape(48, 48)) < 1e-3) & (buffers["depth"][0] > 0)
     floor = ndimage.binary_erosion(is_floor & (expected > 0.001).all(0))
     ours, expected, base = (
         image[:, floor]
-        for image in (buffers["seen_albedo"] * buffers["direct"], expected, buffers["seen_albedo"] * white)
+        for image in (buffers["seen_albedo"] * buffers["direct"], expected, buffers["seen_albedo"] * plain["direct"])
     )
     assert floor.sum() > 400 and (expected > 2 * base).mean() > 0.02, "there is a highlight"
     if alpha == 0.2:
