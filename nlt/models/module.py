@@ -73,7 +73,7 @@ class RenderingModule(Method, L.LightningModule):
     """
 
     # Hyperparameters that a checkpoint must share to be loaded.
-    architecture: tuple[str, ...] = ("width", "depth", "output", "add_emission", "direct_light")
+    architecture: tuple[str, ...] = ("width", "depth", "patch", "output", "add_emission", "direct_light")
     # Fast paths at inference, which `nlt.models.policy.accelerate` switches on; see `Policy`.
     sparse = in_bfloat16 = False
 
@@ -81,6 +81,7 @@ class RenderingModule(Method, L.LightningModule):
         self,
         width: int = 64,
         depth: int = 3,
+        patch: int = 1,
         output: Literal["radiance", "demodulated"] = "radiance",
         add_emission: bool = True,
         direct_light: bool = False,
@@ -97,6 +98,7 @@ class RenderingModule(Method, L.LightningModule):
         Args:
             width: feature maps of the U-Net's first level.
             depth: number of times the U-Net halves the resolution.
+            patch: the U-Net's first level has one pixel for each patch of so many pixels squared; 1 in the paper.
             output: how the U-Net's channels become an image. "radiance" is the paper's: three channels are the image.
                 "demodulated": albedo times the first three channels, plus the last three. A method without the albedo
                 as input predicts radiance either way.
@@ -117,7 +119,7 @@ class RenderingModule(Method, L.LightningModule):
             seed: seed of the random numbers that a method draws in training.
         """
         super().__init__()
-        check_at_least(1, width=width)
+        check_at_least(1, width=width, patch=patch)
         check_at_least(0, depth=depth)
         self.save_hyperparameters()
         if direct_light and not self.reads_direct_light:
@@ -125,7 +127,7 @@ class RenderingModule(Method, L.LightningModule):
             raise UserError(f"model.init_args.direct_light: {name} does not read the G-buffer; leave it out")
         self.loss = getattr(losses, loss)
         # channels_last is the fastest layout of the convolutions.
-        unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3)
+        unet = UNet(self.feature_channels, width, depth, 6 if self.demodulates else 3, patch)
         self.unet = unet.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._metrics: list[ImageMetrics] = []  # in a list, which keeps them out of the parameters and the checkpoint
 
@@ -346,8 +348,8 @@ class RenderingModule(Method, L.LightningModule):
         """
         if checkpoint.get("method") != self.class_path():
             raise _wrong_method(path, checkpoint, type(self))
-        # An option that is younger than the checkpoint was off in its training.
-        saved = dict.fromkeys(self.architecture, False) | checkpoint["architecture"]
+        # An option that is younger than the checkpoint had no effect in its training.
+        saved = dict.fromkeys(self.architecture, False) | {"patch": 1} | checkpoint["architecture"]
         different = [name for name in self.architecture if name not in may_differ and saved[name] != self.hparams[name]]
         if different:
             raise UserError(

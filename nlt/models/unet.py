@@ -55,23 +55,45 @@ def sparse_convolution(conv: nn.Conv2d, x: Tensor, sparse: Sequence[SparseMap]) 
     return padded[..., 1:-1, 1:-1]
 
 
+def sparse_unshuffle(sparse: SparseMap, height: int, width: int, patch: int) -> SparseMap:
+    """Return `F.pixel_unshuffle` by `patch` of a sparse map of (B, C, height, width), padded to whole patches."""
+    rows, pixels = sparse
+    line, column = pixels // width, pixels % width
+    image, line = line // height, line % height
+    place = F.one_hot(line % patch * patch + column % patch, patch**2).to(rows.dtype)  # within its patch
+    first = (image * -(-height // patch) + line // patch) * -(-width // patch) + column // patch
+    return SparseMap((rows[:, :, None] * place[:, None]).flatten(1), first)
+
+
 class UNet(nn.Module):
     """Supplementary, "Image Synthesis Layer": (B, in_channels, H, W) -> (B, out_channels, H, W), any H, W.
 
     The supplementary's figure reduces the resolution in three steps and the main text names four blocks:
     `depth` counts the steps. The number of features starts at `width` and doubles at each step. The output is not
     bounded. The last of the `in_channels` may be given as sparse maps.
+
+    A `patch` above 1 is not in the paper. The first level then has one pixel for each patch of `patch` x `patch`
+    pixels, whose channels it reads and predicts together (sub-pixel convolution, Shi et al. 2016). So no convolution
+    runs at full resolution.
     """
 
-    def __init__(self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3) -> None:
+    def __init__(
+        self, in_channels: int, width: int = 64, depth: int = 3, out_channels: int = 3, patch: int = 1
+    ) -> None:
         super().__init__()
+        self.patch = patch
         widths = [width * 2**level for level in range(depth + 1)]
-        self.conv_in = nn.Conv2d(in_channels, width, 3, padding=1)
+        self.conv_in = nn.Conv2d(in_channels * patch**2, width, 3, padding=1)
         self.down = nn.ModuleList(ConvBlock(widths[max(i - 1, 0)], widths[i]) for i in range(depth + 1))
         self.up = nn.ModuleList(UpBlock(widths[i + 1] + widths[i], widths[i]) for i in reversed(range(depth)))
-        self.conv_out = nn.Conv2d(width, out_channels, 3, padding=1)
+        self.conv_out = nn.Conv2d(width, out_channels * patch**2, 3, padding=1)
 
     def forward(self, x: Tensor, sparse: Sequence[SparseMap] = ()) -> Tensor:
+        height, width = x.shape[-2:]
+        if self.patch > 1:
+            x = F.pixel_unshuffle(F.pad(x, (0, -width % self.patch, 0, -height % self.patch)), self.patch)
+            x = x.contiguous(memory_format=torch.channels_last)
+            sparse = [sparse_unshuffle(part, height, width, self.patch) for part in sparse]
         x = self.down[0](sparse_convolution(self.conv_in, x, sparse) if sparse else self.conv_in(x))
         skips = []
         for block in self.down[1:]:
@@ -79,4 +101,4 @@ class UNet(nn.Module):
             x = block(F.max_pool2d(x, 2, ceil_mode=True))  # ceil_mode keeps a side of 1
         for block, skip in zip(self.up, reversed(skips), strict=True):
             x = block(x, skip)
-        return self.conv_out(F.relu(x))
+        return F.pixel_shuffle(self.conv_out(F.relu(x)), self.patch)[..., :height, :width]

@@ -374,13 +374,15 @@ def test_checkpoint_of_another_method(tmp_path, checkpoints, wanted, options, sa
 
 
 def test_checkpoint_older_than_an_option():
-    """The option was off in its training."""
+    """The option had no effect in its training."""
     checkpoint = {}
     GuidedOneSample(**SIZE).on_save_checkpoint(checkpoint)
-    del checkpoint["architecture"]["relative"]
+    del checkpoint["architecture"]["relative"], checkpoint["architecture"]["patch"]
     GuidedOneSample(**SIZE).on_load_checkpoint(checkpoint)
     with pytest.raises(UserError, match="checkpoint has relative=False, this model relative=True"):
         GuidedOneSample(relative=True, **SIZE).on_load_checkpoint(checkpoint)
+    with pytest.raises(UserError, match="checkpoint has patch=1, this model patch=2"):
+        GuidedOneSample(patch=2, **SIZE).on_load_checkpoint(checkpoint)
 
 
 @pytest.mark.parametrize("config", ["nlt_photons", "denoising_1_4"])

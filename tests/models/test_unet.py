@@ -72,3 +72,28 @@ def test_receptive_field_spans_the_levels():
     net, x = UNet(1, width=4), torch.zeros(1, 1, 32, 32, requires_grad=True)
     net(x + torch.rand(x.shape))[0, :, 0, 0].sum().backward()
     assert x.grad[0, 0, :, 0].nonzero().max() >= 16
+
+
+@pytest.mark.parametrize("size", [(8, 6), (7, 5), (1, 3)])
+def test_patches(size):
+    """Patches need not divide the image, and sparse maps give the same as dense ones."""
+    torch.manual_seed(0)
+    net = UNet(5, width=4, depth=1, out_channels=2, patch=2).double().eval()
+    x = torch.randn(3, 3, *size, dtype=torch.float64)
+    rows, pixels = torch.randn(40, 2, dtype=torch.float64), torch.randint(3 * size[0] * size[1], (40,))
+    image = torch.zeros(3, *size, 2, dtype=torch.float64)
+    image.view(-1, 2).index_add_(0, pixels, rows)
+    dense = net(torch.cat([x, image.permute(0, 3, 1, 2)], dim=1))
+    assert dense.shape == (3, 2, *size)
+    with torch.no_grad():
+        torch.testing.assert_close(net(x, [SparseMap(rows, pixels)]), dense)
+
+
+def test_without_levels_a_pixel_sees_its_patch_and_those_around():
+    """The pixels of a patch are told apart: each one's output depends on all pixels of the patch."""
+    torch.manual_seed(0)
+    net, x = UNet(1, width=4, depth=0, patch=2), torch.randn(1, 1, 24, 24, requires_grad=True)
+    values = net(x)[0, 0, 12:14, 12:14].flatten()
+    gradients = [torch.autograd.grad(value, x, retain_graph=True)[0][0, 0, 12:14, 12:14] for value in values]
+    assert all(gradient.all() for gradient in gradients)
+    assert not any(torch.equal(gradients[0], gradient) for gradient in gradients[1:])
