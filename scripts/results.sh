@@ -48,8 +48,8 @@ if [ "$scale" = small ]; then
         --out results/front_builtin_256 \
         --methods $front
     room --config front --scale medium --seeds 3 --out results/front_256 \
-        --methods cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_16@direct_narrow guided_4spp@direct \
-        guided_4spp_1_2@direct $peers path_tracing_1 path_tracing_4
+        --methods cnn@direct cnn@direct_patches guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_patches \
+        guided_1spp_1_16@direct_patches guided_4spp@direct guided_4spp_1_2@direct $peers path_tracing_1 path_tracing_4
     room --config front --scale demo --seeds 3 --out results/front_real \
         --methods cnn@direct guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected $peers
@@ -61,7 +61,7 @@ if [ "$scale" = small ]; then
         guided_1spp@direct_other_rooms guided_1spp@direct_corrected_other_rooms \
         guided_1spp_relative@direct_corrected_other_rooms oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2
     once python scripts/teaser.py results/front_256 --view 8 \
-        --methods path_tracing_1 cnn@direct guided_1spp_1_4@direct oidn_1_balanced guided_1spp@direct oidn_1
+        --methods path_tracing_1 cnn@direct_patches guided_1spp_1_4@direct_patches oidn_1_balanced guided_1spp@direct oidn_1
     once nlt compare --config demo --seeds 3 --workers "${WORKERS:-2}" --out results/front_builtin \
         --methods cnn cnn@direct nlt_photons guided_1spp guided_1spp@direct guided_1spp@direct_corrected \
         guided_1spp_relative@direct_corrected guided_1_1@direct $peers path_tracing_1 path_tracing_4

@@ -14,7 +14,7 @@ from nlt.evaluation.results import load
 from nlt.report.gallery import Shown
 from nlt.report.plots import PICTURE, plt, save
 
-_WIDTH, _TITLE = 2.56, 0.5  # inches: an image, so that one of 256 pixels is drawn as it is, and its title
+_WIDTH, _TITLE = 2.56, 0.7  # inches: an image, so that one of 256 pixels is drawn as it is, and its title
 
 
 def main() -> None:
@@ -28,7 +28,8 @@ def main() -> None:
     images = Shown.load(results)
     if images is None:
         raise UserError(f"{options.results}/images: missing; run nlt compare there again")
-    time = lambda method: f"{label(method)}\n{1000 * results.mean(method, 'time_per_frame_s'):.0f} ms"
+    name = lambda method: label(method).replace(", ", "\n").replace("_", " ")
+    time = lambda method: f"{name(method)}\n{1000 * results.mean(method, 'time_per_frame_s'):.0f} ms"
     pictures = {time(method): images.methods[method][options.view] for method in options.methods}
     pictures["Reference"] = images.reference[options.view]
     figure, axes = plt.subplots(1, len(pictures), figsize=(_WIDTH * len(pictures), _WIDTH + _TITLE), squeeze=False)
