@@ -72,7 +72,7 @@ FIELDS: dict[str, Field] = {
         "float32",
         _RADIANCE,
         "what the surface, or what metal and glass show, reflects of direct light, over seen_albedo: without a coat, "
-        "what a white diffuse surface would; with a rough coat, its highlights, too; noise-free",
+        "what a white diffuse surface would; with a coat, the lamp's reflection in it, too; noise-free",
     ),
     "seen_albedo": Field(
         (3, "H", "W"),

@@ -21,7 +21,7 @@ from nlt.errors import UserError
 from nlt.scenes.description import Experiment, Integrator, SceneDescription, load_description
 from nlt.scenes.state import SceneState, sample_state
 
-FORMAT = 14  # version of the files on disk
+FORMAT = 15  # version of the files on disk
 _MOST_EVALUATED = 8  # samples in a shard of val or test
 _LEAST_SIDE = 8  # of an image, in pixels
 _DRAWS = 1000  # attempts to find a state that no other split has

@@ -25,8 +25,11 @@ _SHADOW_RAYS = 16  # of a pixel to each emitter; of a fine pixel one from each p
 # A ray is followed from a mirror, and through a thin pane or both sides of a thick one. Through more, as in a wine
 # glass, one of a pixel's few rays may find a lamp that almost no path finds, and the pixel becomes a bright dot.
 _MOST_MIRRORS = 2
-_BRIGHTEST = 4  # of a highlight, in white surfaces; a sharper one would show the shadow rays' points one by one
+# Brightest highlight of `principled`, in white surfaces. Its lobes cannot be sampled one by one, so shadow rays alone
+# find its highlights, and sharper ones would show their points.
+_BRIGHTEST = 4
 _DARK = 0.01  # seen albedo below which the direct light over it is held down
+_FAR, _MARGIN = 1e30, 1e-4  # scene units; the margin gives a flat lamp's box a volume
 _UNIFORM = 0.02  # largest difference to a neighbour's albedo up to which a pixel is its centre's
 
 
@@ -51,7 +54,8 @@ class GBufferTracer:
             **camera_values(self.scene, camera),
         }
         fixed["size"] = mi.Vector2f(camera.width, camera.height)
-        dr.make_opaque(fixed["size"])
+        fixed["lamps"] = self._corners_of_lamps()
+        dr.make_opaque(fixed["size"], fixed["lamps"])
         is_flat = self.scene.environment is None and all(lamp.primitive_count() <= 2 for lamp in self._lamps)
         is_fine = camera.matrix[0, 0] >= _FINE
         fixed["places"] = _PLACES_FINE if is_fine else _PLACES_COARSE
@@ -84,6 +88,14 @@ class GBufferTracer:
             sees |= (enter <= leave) & (leave > 0)
         return sees
 
+    def _corners_of_lamps(self) -> tuple[Any, Any]:
+        """Return two opposite corners of the box around all lamps, which is everything where there is a sky."""
+        if self.scene.environment is not None or not self._lamps:
+            return mi.Point3f(-_FAR), mi.Point3f(_FAR)
+        boxes = np.array([[lamp.bbox().min, lamp.bbox().max] for lamp in self._lamps])
+        low, high = boxes[:, 0].min(0) - _MARGIN, boxes[:, 1].max(0) + _MARGIN
+        return mi.Point3f(low.tolist()), mi.Point3f(high.tolist())
+
     def transmits(self, camera: Camera) -> np.ndarray:
         """Return (H, W) bool: whether the surface at the pixel centre transmits light, as glass does."""
         lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
@@ -92,7 +104,16 @@ class GBufferTracer:
 
 
 def _gbuffer(
-    scene: Any, masks: bool, sky: bool, places: int, shadow_rays: int, corner: Any, lit: Any, size: Any, **camera: Any
+    scene: Any,
+    masks: bool,
+    sky: bool,
+    lamps: tuple[Any, Any],
+    places: int,
+    shadow_rays: int,
+    corner: Any,
+    lit: Any,
+    size: Any,
+    **camera: Any,
 ) -> tuple:
     """Return point, normal, albedo, emission, whether the ray hit, and direct light. `lit` is 0 where no lamp is seen.
 
@@ -107,7 +128,7 @@ def _gbuffer(
         varies, escapes = _compare_neighbours(valid, albedo, corner, size, sky)
     light: Any = ()
     if shadow_rays:
-        mean, *light = _lit_albedo(scene, masks, places, shadow_rays, trace)
+        mean, *light = _lit_albedo(scene, masks, mi.BoundingBox3f(*lamps), places, shadow_rays, trace)
     else:
         mean = _pixel_mean(trace, _albedo, _hammersley, places, varies)
     albedo = dr.select(varies, mean, albedo)
@@ -141,9 +162,13 @@ def _seen_albedo(interaction: Any) -> Any:
 
 def _lobes(interaction: Any, direction: Any, kinds: Any) -> Any:
     """Return the value of the lobes of some kinds, times the cosine; of `principled`, which has no parts, of all."""
+    return mi.Color3f(interaction.bsdf().eval(_only(kinds), interaction, direction, interaction.is_valid()))
+
+
+def _only(kinds: Any) -> Any:
     context = mi.BSDFContext()
     context.type_mask = int(kinds)
-    return mi.Color3f(interaction.bsdf().eval(context, interaction, direction, interaction.is_valid()))
+    return context
 
 
 def _compare_neighbours(valid: Any, albedo: Any, corner: Any, size: Any, sky: bool) -> tuple[Any, Any]:
@@ -177,7 +202,7 @@ def _pixel_mean(trace: Callable, value: Callable, place: Callable, count: int, a
     return total / count
 
 
-def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
+def _lit_albedo(scene: Any, masks: bool, lamps: Any, places: int, rays: int, trace: Callable) -> tuple[Any, Any, Any]:
     """Return the albedo, the direct light, and the seen albedo: means over places in each pixel.
 
     The direct light is weighted by seen albedo. So their product is the pixel's radiance where surfaces meet, too,
@@ -193,6 +218,7 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
         is_lamp = (bounces > 0) & is_sharp & dr.any(emission > 0)
         # Places on one side of the pixel see points on all sides of a lamp, or edges would be lit by one side only.
         lit, white = _direct(scene, masks, rays, (7 * k + 5) & (places - 1), places, surface)
+        lit += _lamp_in_coat(scene, masks, lamps, rays // places, surface, place) / places
         lit, white = (dr.select(is_lamp, emission, places * part) for part in (lit, white))
         own = tint * dr.select(is_lamp, 1, _seen_albedo(surface))
         return k + 1, albedo + _albedo(first), seen + own, reflected + tint * lit, light + white
@@ -207,10 +233,11 @@ def _lit_albedo(scene: Any, masks: bool, places: int, rays: int, trace: Callable
 def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface: Any) -> tuple[Any, Any]:
     """Return the part of the reflected light that every `stride`-th of `rays` shadow rays finds.
 
-    First what `surface` reflects towards the camera, diffusely and as a highlight, second what a white surface would.
+    First what `surface` reflects towards the camera, second what a white surface would. What shadow rays and
+    `_lamp_in_coat` both find is weighted.
     """
     normal = dr.select(surface.wi.z < 0, -surface.sh_frame.n, surface.sh_frame.n)
-    albedo = _albedo(surface)
+    albedo, is_coated = _albedo(surface), _is_coated(surface)
 
     def step(k: Any, lit: Any, white: Any) -> tuple:
         # The first coordinate also chooses the emitter, and the triangle of a mesh.
@@ -225,12 +252,67 @@ def _direct(scene: Any, masks: bool, rays: int, first: Any, stride: int, surface
         parts = dr.pi * rays * lamp.pdf  # so many would cover all above the surface
         radiance = dr.select(is_area, radiance * parts / (1 + parts), radiance)
         received = mi.Color3f(radiance) * dr.maximum(dr.dot(lamp.d, normal), 0) / dr.pi
-        value = _lobes(surface, surface.to_local(lamp.d), mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy) * radiance
-        return k + stride, lit + dr.minimum(value, (albedo + _BRIGHTEST) * received), white + received
+        direction = surface.to_local(lamp.d)
+        diffuse = _lobes(surface, direction, mi.BSDFFlags.Diffuse)
+        gloss, chance = surface.bsdf().eval_pdf(_only(_gloss()), surface, direction, is_coated)
+        held_down = dr.minimum(diffuse * radiance, (albedo + _BRIGHTEST) * received)
+        chance = dr.select(lamp.delta, 0, chance)  # no reflected ray hits a point light
+        value = (diffuse + gloss * _share(rays // stride * lamp.pdf, chance)) * radiance
+        value = dr.select(_has_parts(diffuse, gloss), value, held_down)
+        return k + stride, lit + value, white + received
 
     state = (mi.UInt32(first), mi.Color3f(0), mi.Color3f(0))
     _, lit, white = dr.while_loop(state, lambda k, *_: surface.is_valid() & (k < rays), step)
     return lit / rays, white / rays
+
+
+def _lamp_in_coat(scene: Any, masks: bool, lamps: Any, shadow_rays: int, surface: Any, lobe: Any) -> Any:
+    """Return the radiance of lamps and sky that a diffuse surface's coat reflects towards the camera.
+
+    One ray is reflected by the coat. It and the `shadow_rays` are weighted by the balance heuristic (Veach 1997).
+    """
+    active, black = _is_coated(surface), mi.Color3f(0)
+    if not _any(active):
+        return black
+    bsdf = surface.bsdf()
+    sample, weight = bsdf.sample(_only(_gloss()), surface, mi.Float(0.9999), lobe, active)
+    ray = surface.spawn_ray(surface.to_world(sample.wo))
+    active &= (sample.pdf > 0) & lamps.ray_intersect(ray)[0]
+    is_delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    parts = (bsdf.eval(_only(kinds), surface, sample.wo, active) for kinds in (mi.BSDFFlags.Diffuse, _gloss()))
+    active &= is_delta | _has_parts(*parts)
+    ray.maxt = dr.select(active, ray.maxt, 0)
+    hit = first_surface(scene, ray, masks)
+    emission = dr.select(active, _emission(scene, hit), 0)
+    active &= dr.any(emission > 0)
+    if not _any(active):
+        return black
+    towards = mi.DirectionSample3f(scene, hit, surface)
+    chance = shadow_rays * scene.pdf_emitter_direction(surface, towards, active)
+    return emission * mi.Color3f(weight) * dr.select(is_delta, 1, _share(sample.pdf, chance))
+
+
+def _gloss() -> int:
+    """Return the lobes of coats, as flags."""
+    return int(mi.BSDFFlags.GlossyReflection) | int(mi.BSDFFlags.DeltaReflection)
+
+
+def _is_coated(surface: Any) -> Any:
+    """Return whether the surface has a diffuse base under a coat, rough or smooth."""
+    if not _any(surface.is_valid()):
+        return mi.Bool(False)
+    flags = surface.bsdf().flags()
+    return surface.is_valid() & mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) & (flags & _gloss() != 0)
+
+
+def _has_parts(diffuse: Any, gloss: Any) -> Any:
+    """Return whether a BSDF's lobes have values of their own; `principled` gives the sum whichever is asked for."""
+    return dr.any(mi.Color3f(diffuse) != mi.Color3f(gloss))
+
+
+def _share(own: Any, other: Any) -> Any:
+    """Return the weight of a sample between two ways of sampling, by the balance heuristic."""
+    return own / dr.maximum(own + other, 1e-20)
 
 
 def _grid(k: Any, count: int) -> Any:

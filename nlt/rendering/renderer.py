@@ -109,10 +109,9 @@ class Renderer:
             radiance seen directly from lamps and from the environment, as means over each pixel's area. If `direct`,
             also seen_albedo (3, H, W), the mean share of light that is reflected to the camera, there or by what metal
             and glass show, which is less than the albedo under a coat; and direct (3, H, W), which times seen_albedo is
-            the mean of what is reflected of the lamps, with their highlights on rough coats; where nothing is, what
-            white would reflect. Rough metal shows
-            another direction of its lobe in each place. A lamp in a mirror is a white surface that reflects what it
-            emits; lamps and sky in rough metal are left out.
+            the mean of what is reflected of lamps and sky, also by a coat; where nothing is, what white would reflect.
+            Rough metal shows another direction of its lobe in each place. A lamp in a mirror is a white surface that
+            reflects what it emits; lamps and sky in rough metal are left out.
         """
         return self._gbuffer.trace(camera, direct)
 
