@@ -157,7 +157,7 @@ def test_direct_light_next_to_the_lamp(tmp_path, monkeypatch):
     assert 0.5 < share.max() < 1.2
 
 
-def coated_floor(tmp_path, coated):
+def coated_floor(tmp_path, coated, sky=""):
     """Coat a room's floor and return a camera, the G-buffers before and after, and the direct light that Mitsuba sees.
 
     The last one, (3, 48, 48), is what the coated room reflects of its lamp on Mitsuba's paths of that length.
@@ -167,7 +167,7 @@ def coated_floor(tmp_path, coated):
     camera = Camera.look_at(np.array([0.9, 0.8, -0.6]), np.array([0.1, 0, 0.0]), np.array([0, 1.0, 0]), 60, 48, 48)
     plain = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     diffuse = '"diffuse"><rgb name="reflectance" value="0.7, 0.6, 0.5"/>'
-    source.write_text(source.read_text().replace(diffuse, coated, 1))
+    source.write_text(source.read_text().replace(diffuse, coated, 1).replace("</scene>", f"{sky}</scene>"))
     buffers = Renderer(Scene(description, "fixed_lights")).gbuffer(camera, direct=True)
     scene = mi.load_file(str(source), optimize=False)
     render = lambda depth: mi.render(
@@ -235,6 +235,18 @@ def test_highlights_of_principled(tmp_path, roughness):
     else:
         assert (base.mean(1) < ours.mean(1)).all() and (ours.mean(1) < expected.mean(1)).all()
         assert ours.max() < expected.max() / 2
+
+
+def test_a_coat_reflects_the_sky(tmp_path):
+    """And the lamp beside it, as Mitsuba's paths of that length do."""
+    sky = '<emitter type="constant"><rgb name="radiance" value="0.2, 0.3, 0.4"/></emitter>'
+    coated = '"plastic"><rgb name="diffuse_reflectance" value="0.02"/>'
+    camera, _, buffers, expected = coated_floor(tmp_path, coated, sky)
+    is_floor = (np.abs(surface(camera, buffers)[0][:, 1].reshape(48, 48)) < 1e-3) & (buffers["depth"][0] > 0)
+    floor = ndimage.binary_erosion(is_floor)
+    assert floor.sum() > 400
+    reflected = lambda image: image[:, floor].mean(1)
+    np.testing.assert_allclose(reflected(buffers["seen_albedo"] * buffers["direct"]), reflected(expected), rtol=0.05)
 
 
 def test_direct_light_of_the_sky(tmp_path):
