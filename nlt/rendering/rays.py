@@ -30,3 +30,9 @@ def camera_values(scene: Scene, camera: Camera) -> dict[str, Any]:
 def camera_ray(place: Any, origin: Any, du: Any, dv: Any, d0: Any) -> Any:
     """Return the ray through `place`, in pixels from the image's upper left corner; the rest are `camera_values`."""
     return mi.Ray3f(origin, dr.normalize(d0 + place.x * du + place.y * dv))
+
+
+def hammersley(k: Any, count: int) -> Any:
+    """Return the k-th of `count` points that are spread evenly over the unit square."""
+    reversed_bits = mi.Float(dr.brev(mi.UInt32(k))) / 2**32
+    return mi.Point2f((mi.Float(k) + 0.5) / count, reversed_bits + 0.5 / count)
