@@ -12,9 +12,10 @@ from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import load
 from nlt.report.gallery import Shown
-from nlt.report.plots import PICTURE, plt, save
+from nlt.report.plots import PICTURE, in_lines, plt, save
 
 _WIDTH, _TITLE = 2.56, 0.7  # inches: an image, so that one of 256 pixels is drawn as it is, and its title
+_CHARACTERS = 28  # of a line of the title
 
 
 def main() -> None:
@@ -28,8 +29,8 @@ def main() -> None:
     images = Shown.load(results)
     if images is None:
         raise UserError(f"{options.results}/images: missing; run nlt compare there again")
-    name = lambda method: label(method).replace(", ", "\n").replace("_", " ")
-    time = lambda method: f"{name(method)}\n{1000 * results.mean(method, 'time_per_frame_s'):.0f} ms"
+    milliseconds = lambda method: 1000 * results.mean(method, "time_per_frame_s")
+    time = lambda method: f"{in_lines(label(method), _CHARACTERS)}\n{milliseconds(method):.0f} ms"
     pictures = {time(method): images.methods[method][options.view] for method in options.methods}
     pictures["Reference"] = images.reference[options.view]
     figure, axes = plt.subplots(1, len(pictures), figsize=(_WIDTH * len(pictures), _WIDTH + _TITLE), squeeze=False)

@@ -70,8 +70,7 @@ class GBufferTracer:
         sees = np.zeros(camera.width * camera.height, bool)
         directions = camera.view_directions().reshape(3, -1)
         diagonal = np.hypot(1 / camera.matrix[0, 0], 1 / camera.matrix[1, 1])  # of a pixel, at depth 1
-        for lamp in self._lamps:
-            corners = np.array([lamp.bbox().min, lamp.bbox().max])
+        for corners in self._lamp_boxes():
             box = corners / self.scene.description.units_per_metre - camera.position
             # Every ray in a pixel is at most half a diagonal away from the ray through the centre.
             margin = diagonal / 2 * np.linalg.norm(np.abs(box).max(0)) + 1e-4
@@ -86,9 +85,12 @@ class GBufferTracer:
         """Return two opposite corners of the box around all lamps, which is everything where there is a sky."""
         if self.scene.environment is not None or not self._lamps:
             return mi.Point3f(-_FAR), mi.Point3f(_FAR)
-        boxes = np.array([[lamp.bbox().min, lamp.bbox().max] for lamp in self._lamps])
-        low, high = boxes[:, 0].min(0) - _MARGIN, boxes[:, 1].max(0) + _MARGIN
-        return mi.Point3f(low.tolist()), mi.Point3f(high.tolist())
+        low, high = self._lamp_boxes().swapaxes(0, 1)
+        return mi.Point3f((low.min(0) - _MARGIN).tolist()), mi.Point3f((high.max(0) + _MARGIN).tolist())
+
+    def _lamp_boxes(self) -> np.ndarray:
+        """Return the two corners of each lamp's bounding box (lamps, 2, 3), in scene units."""
+        return np.array([[lamp.bbox().min, lamp.bbox().max] for lamp in self._lamps])
 
     def transmits(self, camera: Camera) -> np.ndarray:
         """Return (H, W) bool: whether the surface at the pixel centre transmits light, as glass does."""

@@ -77,12 +77,15 @@ def add_legend(
     figure.legend(entries.values(), entries, loc=place, ncols=columns)
 
 
+def in_lines(name: str, characters: int) -> str:
+    """Return a method's name broken before its variant, or else before its brackets, and at so many characters."""
+    broken = name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(")
+    return "\n".join(textwrap.fill(line.replace("_", " "), characters) for line in broken.split("\n"))
+
+
 def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
     """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
-    broken = (name.replace(", ", "\n") if ", " in name else name.replace(" (", "\n(") for name in columns)
-    titles = [
-        "\n".join(textwrap.fill(line.replace("_", " "), _TITLE) for line in title.split("\n")) for title in broken
-    ]
+    titles = [in_lines(name, _TITLE) for name in columns]
     top = _LINE * (2 + max(title.count("\n") for title in titles))
     size = (_INCH * len(columns), _INCH * rows + top + bottom)
     figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)

@@ -89,8 +89,8 @@ def test_patches(size):
         torch.testing.assert_close(net(x, [SparseMap(rows, pixels)]), dense)
 
 
-def test_without_levels_a_pixel_sees_its_patch_and_those_around():
-    """The pixels of a patch are told apart: each one's output depends on all pixels of the patch."""
+def test_pixels_of_a_patch_are_told_apart():
+    """Without any level, too: each one's output depends on all pixels of the patch."""
     torch.manual_seed(0)
     net, x = UNet(1, width=4, depth=0, patch=2), torch.randn(1, 1, 24, 24, requires_grad=True)
     values = net(x)[0, 0, 12:14, 12:14].flatten()
