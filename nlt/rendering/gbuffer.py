@@ -40,8 +40,7 @@ class GBufferTracer:
 
     def trace(self, camera: Camera, direct: bool) -> dict[str, np.ndarray]:
         """Return the buffers that `Renderer.gbuffer` describes."""
-        corners = np.floor(camera.centres()).astype(np.float32)
-        lanes = {"corner": ("Point2f", corners), "lit": ("Float", self._may_see_lamp(camera))}
+        lanes = {"corner": ("Point2f", camera.corners()), "lit": ("Float", self._may_see_lamp(camera))}
         fixed = {
             "masks": self.scene.masks,
             "sky": self.scene.environment is not None,
@@ -59,11 +58,11 @@ class GBufferTracer:
         metres = point.astype(float) / self.scene.description.units_per_metre
         # Depth is measured from the camera centre along the optical axis.
         depth = np.where(valid, (metres - camera.position) @ camera.rotation[:, 2], 0.0)
-        buffers = {"depth": depth[:, None].astype(np.float32), "normal": np.where(valid[:, None], normal, 0)}
-        buffers |= {"albedo": albedo, "emission": emission}
+        buffers = {"depth": depth.astype(np.float32), "normal": np.where(valid, normal.T, 0)}
+        buffers |= {"albedo": albedo.T, "emission": emission.T}
         if direct:
-            buffers["direct"], buffers["seen_albedo"] = light
-        return {name: values.T.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
+            buffers["direct"], buffers["seen_albedo"] = (values.T for values in light)
+        return {name: values.reshape(-1, camera.height, camera.width) for name, values in buffers.items()}
 
     def _may_see_lamp(self, camera: Camera) -> np.ndarray:
         """Return (H W,) bool: the pixels that cover part of a lamp's bounding box. No others have a lamp's emission."""

@@ -69,8 +69,13 @@ class Camera:
 
     def centres(self) -> np.ndarray:
         """(H*W, 2) continuous coordinates of all pixel centres, row by row."""
-        rows, columns = np.mgrid[: self.height, : self.width]
-        return np.stack([columns.ravel(), rows.ravel()], 1) + 0.5
+        return self.corners() + 0.5
+
+    def corners(self) -> np.ndarray:
+        """(H*W, 2) float32 coordinates of the upper left corners of all pixels, row by row."""
+        corners = np.empty((2, self.height, self.width), np.float32)
+        corners[0], corners[1] = np.arange(self.width), np.arange(self.height)[:, None]
+        return corners.reshape(2, -1).T
 
     def view_directions(self) -> np.ndarray:
         """(3, H, W) float32 view direction map: unit world directions through pixel centres (Sec. Method)."""

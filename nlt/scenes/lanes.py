@@ -89,6 +89,6 @@ def _upload(kind: Any, array: np.ndarray) -> Any:
 
 def _download(value: Any, count: int) -> np.ndarray:
     if dr.depth_v(value) > 1:
-        return np.stack([_download(component, count) for component in value], axis=-1)
+        return np.stack([_download(component, count) for component in value]).T
     # A value that is the same for all lanes has a width of one.
     return np.broadcast_to(np.array(value), count)
