@@ -10,7 +10,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from nlt.cli import Parser, exit_code, pair, positive
+from nlt.arguments import Parser, pair, positive
+from nlt.cli import exit_code
 from nlt.waiting import wait_passively
 
 

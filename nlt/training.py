@@ -5,23 +5,20 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import lightning as L
 import yaml
 from jsonargparse import ArgumentError
-from lightning.pytorch.callbacks import BasePredictionWriter, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from PIL import Image
 
+from nlt.callbacks import Checkpoints, Predictions
 from nlt.config import read_configs
 from nlt.data.datamodule import LightTransportDataModule
-from nlt.data.files import write_bytes
-from nlt.data.sample import BUFFERS
-from nlt.display import display
 from nlt.errors import UserError
+from nlt.lightning_errors import one_line, with_source
 from nlt.models.clouds import CloudMethod
 from nlt.models.factory import load_method, method_class, read_checkpoint, without_unused
 from nlt.models.image_grid import ImageGrid
@@ -43,60 +40,6 @@ _NOISE = (
 _LIGHTNING_CHECKPOINTS = ("best", "last", "hpc")
 # A setting as `key=value`, without the dashes of Lightning's `--key=value`.
 _SETTING = re.compile(r"(data|model|trainer|seed_everything|ckpt_path|start_from)\b[\w.+]*=")
-
-
-class Checkpoints(ModelCheckpoint):
-    """Saves the last finished epoch's checkpoint and keeps the previous one until the new one is complete."""
-
-    def __init__(self) -> None:
-        super().__init__(filename="{epoch}-{step}", save_top_k=1, save_on_train_epoch_end=True)
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Mark the last epoch as completed when a run resumes with max_steps, as Lightning does with max_epochs.
-
-        Otherwise Lightning would end that epoch a second time, after one more batch.
-        """
-        super().on_train_start(trainer, pl_module)
-        loop: Any = trainer.fit_loop
-        if loop.restarted_on_epoch_end:
-            loop.epoch_progress.increment_completed()
-            loop._restarting = loop.epoch_loop.restarting = False
-            loop.reset_restart_stage()
-            loop.epoch_loop.reset_restart_stage()
-
-
-class Predictions(BasePredictionWriter):
-    """Writes the images of `nlt predict` as displayed to predictions/ in the run's directory, by sample index.
-
-    With `exr`, it also writes multi-layer EXRs, whose reference is the mean of the two halves.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(write_interval="batch")
-        self.exr = False
-
-    def on_predict_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.directory = Path(trainer.log_dir or trainer.default_root_dir) / "predictions"
-        self.directory.mkdir(parents=True, exist_ok=True)
-
-    def write_on_batch_end(
-        self, trainer: Any, pl_module: Any, prediction: Any, indices: Any, batch: Any, *_: Any
-    ) -> None:
-        images = (255 * display(prediction, batch["exposure"])).round().byte().permute(0, 2, 3, 1).cpu().numpy()
-        for index, image in zip(batch["index"].tolist(), images, strict=True):
-            Image.fromarray(image).save(self.directory / f"{index:07d}.png")
-        if self.exr:
-            from nlt.rendering.exr import exr  # here, because it needs Mitsuba
-
-            layers = {"radiance": prediction, **{name: batch[name] for name in BUFFERS}}
-            layers["reference"] = (batch["reference_a"] + batch["reference_b"]) / 2
-            for row, index in enumerate(batch["index"].tolist()):
-                content = exr({name: images[row].float().cpu().numpy() for name, images in layers.items()})
-                write_bytes(self.directory / f"{index:07d}.exr", content)
-
-    def on_predict_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.is_global_zero:
-            print(self.directory)
 
 
 class NLTCLI(LightningCLI):
@@ -152,7 +95,7 @@ class NLTCLI(LightningCLI):
                     if isinstance(callback, Predictions):
                         callback.exr = True
         except (ValueError, MisconfigurationException) as error:
-            raise UserError(_one_line(str(error))) from None
+            raise UserError(one_line(str(error))) from None
 
     def _start_from(self, checkpoint: str) -> None:
         """Copy the weights of a checkpoint; with `ckpt_path`, Lightning overrides them by those of the resumed run.
@@ -230,7 +173,7 @@ def _run(kind: type[NLTCLI], arguments: list[str], callbacks: Sequence[L.Callbac
     except ArgumentError as error:
         sources = {file: yaml.safe_dump(read_configs([file])) for file in configs}
         sources |= {setting: setting for setting in settings}
-        raise UserError(_with_source(str(error), sources, command)) from None
+        raise UserError(with_source(str(error), sources, command)) from None
     except UserError as error:  # an error from a loader process contains its traceback
         raise type(error)(str(error).rpartition("UserError: ")[2].strip()) from None
 
@@ -257,39 +200,6 @@ def _merged(configs: list[str], settings: list[str]) -> list[str]:
     elif model and not any(setting.startswith("--model") for setting in settings):
         raise UserError(f"{place}: model.class_path: missing; add a --config from configs/model")
     return [f"--config={yaml.safe_dump(content)}"] if configs else []
-
-
-def _one_line(message: str) -> str:
-    """Return a message of jsonargparse or Lightning in one line, without the alternatives that were not meant."""
-    message = " ".join(message.split())
-    message = re.sub(r"Group '([\w.]+)' does not accept option '(\w+)'", r"Option '\1.\2' is not accepted", message)
-    message = re.sub(r"Does not validate .*? Errors: - (.*?) - Expected a <class 'NoneType'>.*", r"\1", message)
-    message = re.sub(
-        r"""Parser key "model": Problem with given class_path '(?:\w+\.)*(\w+)': (?=Parser|Option)""", r"\1: ", message
-    )
-    return re.sub(r'Parser key "([\w.]+)": Expected an? (.+?)\. Got value: ', _must_be, message)
-
-
-_KINDS = {"<class 'int'>": "a whole number", "<class 'float'>": "a number", "<class 'bool'>": "true or false"}
-
-
-def _must_be(found: re.Match[str]) -> str:
-    """Return jsonargparse's "Parser key K: Expected a KIND. Got value: " in the words of `nlt.config`."""
-    key, kind = found.groups()
-    options = re.fullmatch(r"typing\.Literal\[(.*)\]", kind)
-    expected = f"one of {options[1].replace(chr(39), '')}" if options else _KINDS.get(kind, kind)
-    return f"{key}: must be {expected}, is "
-
-
-def _with_source(message: str, sources: dict[str, str], command: str) -> str:
-    """Return jsonargparse's message in one line that begins with the files or arguments that it is about."""
-    message = _one_line(message)
-    keys = re.findall(r"""[Oo]ption ['"]([\w.]+)['"]|Parser key ['"]([\w.]+)['"]|([\w.]+): must be""", message)
-    words = "".join(keys[-1]).split(".") if keys else []
-    matching = [name for name, text in sources.items() if all(re.search(rf"\b{word}\b", text) for word in words)]
-    # Settings override configs.
-    place = " + ".join([name for name in matching if "=" in name] or matching or sources) or f"nlt {command}"
-    return f"{place}: {message}; see nlt {command} --help"
 
 
 def trainer_defaults(callbacks: Sequence[L.Callback] = ()) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from conftest import write_room, write_yaml
 from tiny import DATASET, SCALE, copy_dataset, write
 
 from nlt import waiting
-from nlt.cli import _parser, main
+from nlt.arguments import command_parser
+from nlt.cli import main
 from nlt.config import merge
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
@@ -47,7 +48,7 @@ def test_threads_wait_passively_where_the_user_says_nothing(monkeypatch, given, 
 def test_help_imports_nothing_heavy():
     code = """if True:
         import sys
-        from nlt.cli import _parser, main
+        from nlt.cli import main
         try:
             main(["--help"])
         except SystemExit as done:
@@ -72,7 +73,7 @@ def test_every_word_of_help():
                 assert command.description.lower() == f"{choice.help.lower()}." and choice.help[0].islower()
                 look(command, f"{path} {choice.dest}")
 
-    look(_parser(), "nlt")
+    look(command_parser(), "nlt")
 
 
 def test_help_of_fit(capfd):

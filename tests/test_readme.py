@@ -20,7 +20,8 @@ from tiny import TRAINER, write
 
 import nlt.baselines
 from nlt import paths
-from nlt.cli import _LIGHTNING, _parser, main
+from nlt.arguments import LIGHTNING, command_parser
+from nlt.cli import main
 from nlt.data import generate as generation
 from nlt.data.spec import load_spec
 from nlt.evaluation.comparison import Comparison
@@ -122,12 +123,12 @@ def _taken(configs):
 def parse(command):
     """To the end: by the command's own parser, with every config, scene and file that it names."""
     name, *arguments = shlex.split(command)[1:]
-    if name in _LIGHTNING:
+    if name in LIGHTNING:
         parser = argparse.ArgumentParser()
         parser.add_argument("--config", action="append")
         parser.add_argument("--ckpt_path")
         return _taken(tuple(parser.parse_args(arguments).config))
-    options = _parser().parse_args([name, *arguments])
+    options = command_parser().parse_args([name, *arguments])
     scenes = getattr(options, "names", [])
     if name == "generate":
         scenes = load_spec(options.config)[0].scenes

@@ -13,10 +13,10 @@ from torch.utils.data import DataLoader
 from nlt.baselines.cnn import CNN
 from nlt.baselines.denoising import SparseDenoising
 from nlt.baselines.feature_projection import FeatureProjection
+from nlt.callbacks import Checkpoints
 from nlt.models.module import warm_up_and_cosine
 from nlt.models.muon import Muon, orthogonalize
 from nlt.models.nlt import NeuralLightTransport
-from nlt.training import Checkpoints
 
 SIZE = {"width": 4, "num_scenes": SCENES, "num_points": POINTS}
 QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False, "accelerator": "cpu"}
