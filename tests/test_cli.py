@@ -12,8 +12,8 @@ from conftest import write_room, write_yaml
 from tiny import DATASET, SCALE, copy_dataset, write
 
 from nlt import waiting
-from nlt.arguments import command_parser
-from nlt.cli import main
+from nlt.arguments import LIGHTNING, command_parser
+from nlt.cli import _COMMANDS, main
 from nlt.config import merge
 from nlt.data import generate as generation
 from nlt.data.datamodule import LightTransportDataModule
@@ -74,6 +74,11 @@ def test_every_word_of_help():
                 look(command, f"{path} {choice.dest}")
 
     look(command_parser(), "nlt")
+
+
+def test_every_command_does_something():
+    commands = next(action for action in command_parser()._actions if action.dest == "command")
+    assert commands.choices.keys() == _COMMANDS.keys() | LIGHTNING.keys()
 
 
 def test_help_of_fit(capfd):

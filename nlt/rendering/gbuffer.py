@@ -93,7 +93,7 @@ class GBufferTracer:
 
     def transmits(self, camera: Camera) -> np.ndarray:
         """Return (H, W) bool: whether the surface at the pixel centre transmits light, as glass does."""
-        lanes = {"position": ("Point2f", camera.centres().astype(np.float32))}
+        lanes = {"position": ("Point2f", camera.centres())}
         (transmits,) = launch(self._transmits, lanes, masks=self.scene.masks, **camera_values(self.scene, camera))
         return transmits.reshape(camera.height, camera.width)
 

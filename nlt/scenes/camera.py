@@ -68,7 +68,7 @@ class Camera:
         return view @ self.rotation.T
 
     def centres(self) -> np.ndarray:
-        """(H*W, 2) continuous coordinates of all pixel centres, row by row."""
+        """(H*W, 2) float32 coordinates of all pixel centres, row by row."""
         return self.corners() + 0.5
 
     def corners(self) -> np.ndarray:

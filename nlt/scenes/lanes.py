@@ -63,7 +63,7 @@ def launch(kernel: Callable, lanes: Mapping[str, tuple[str, np.ndarray]], **fixe
         fixed: passed to the kernel unchanged.
 
     Returns:
-        One array (n,) or (n, k) per value that the kernel returns.
+        One array (n,) or (n, k) per value that the kernel returns; each of the k columns is contiguous in memory.
     """
     count = len(next(iter(lanes.values()))[1])
     types = {name: getattr(mi, kind) for name, (kind, _) in lanes.items()}
