@@ -80,6 +80,9 @@ if [ "$scale" = gpu ]; then
     room --config table2_real --scale gpu_256 --workers 14 --seeds 2 --out results/real_living_room_256_gpu \
         --methods denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt \
         nlt_photons path_tracing_1 path_tracing_4
+    room --config table2_real --scale gpu_256_9600 --workers 9 --out results/real_living_room_256_gpu_9600 \
+        --methods denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt \
+        nlt_photons path_tracing_1
     room --config table2_real_demodulated --scale gpu_256 --workers 2 --out results/real_living_room_256_gpu_direct \
         --methods guided_1spp@direct cnn@direct
 fi
