@@ -49,12 +49,19 @@ def surroundings(device: torch.device, policy: Policy | None = None) -> dict[str
         "wait_policy": os.environ.get(WAIT_POLICY),
         "platform": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": {name: _version(name) for name in _PACKAGES},
         "mitsuba_variant": f"{variant.name}: {variant.reason}",
         "inception_weights": Path(weights).name if weights else None,
         "clock": {"batch": 1, "warm_up_frames": WARM_UP, "timed_frames": FRAMES},
         "policy": asdict(policy or Policy.for_device(device)),
     }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # nothing but OIDN's rows needs mitsuba-oidn
+        return None
 
 
 def _git(*arguments: str) -> str | None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from nlt.errors import DivergedError, UserError
 from nlt.evaluation.comparison import Comparison
 from nlt.evaluation.provenance import origin, surroundings
-from nlt.evaluation.results import IMAGES, RUNS, load, read_rows, write_images, write_manifest, write_rows
+from nlt.evaluation.results import IMAGES, VIEWS, load, read_rows, write_images, write_manifest, write_rows
 from nlt.evaluation.trainings import Training, generate_datasets, train
 from nlt.models.method import Method
 from nlt.models.policy import Policy, accelerate, default_device
@@ -110,7 +110,7 @@ def stress(
     if measured() != before:  # otherwise keep the manifest of the run that measured them
         write_record()
     section = stress_section(directory.parent)
-    if (directory.parent / RUNS).exists():  # the results of `nlt compare`, whose report shows this section too
+    if (directory.parent / VIEWS).exists():  # the results of `nlt compare`, whose report shows this section too
         results = load(directory.parent)
         write_page(results, write_claims(results), sections=[section])
     print(f"written to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")

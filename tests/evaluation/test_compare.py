@@ -32,7 +32,7 @@ from nlt.data.dataset import LightTransportDataset
 from nlt.data.files import write_bytes
 from nlt.data.spec import DatasetSpec
 from nlt.data.store import points_name
-from nlt.evaluation import clock, compare, comparison, progress
+from nlt.evaluation import clock, compare, comparison, progress, provenance
 from nlt.evaluation.frames import Frames
 from nlt.evaluation.judge import Evaluation
 from nlt.evaluation.paper import published
@@ -381,6 +381,12 @@ def test_a_second_device_adds_its_times(world, trainings, monkeypatch):
             assert first.mean(name, key) == pytest.approx(float(world.rows[name][key] or "nan"), nan_ok=True)
     assert len(results.timings) == 2 + len(world.rows)
     assert "Time per frame by device" in (world.folder / "devices/table.md").read_text()
+
+
+def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
+    """A comparison without OIDN's rows may run where OIDN is not installed."""
+    monkeypatch.setattr(provenance, "_PACKAGES", ("torch", "no-such-package"))
+    assert provenance.surroundings(CPU)["versions"] == {"torch": torch.__version__, "no-such-package": None}
 
 
 def test_one_methods_config_retrains_this_method(world, trainings):
