@@ -16,7 +16,7 @@ from nlt.report.plots import PICTURE, grid, plt, save, shown
 from nlt.report.table_writer import Table, write_texts
 
 FAILURES = "failures.csv"
-_ROWS = 6  # views in samples.webp
+_LINES, _COLUMNS, _SAMPLE = 6, 7, 1.92  # lines of samples.webp, images of a line, inches of an image
 _VIEWS = 3  # in qualitative.webp
 _INSET = 4  # image side / inset side
 WORST = 0.1  # fraction of a method's pixels
@@ -115,12 +115,15 @@ def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray,
 
 
 def draw_samples(images: Shown) -> None:
-    """Draw samples.webp: a row per view, with the noisy training image, every method and the reference as displayed."""
-    views = np.unique(np.linspace(0, len(images.reference) - 1, _ROWS).round().astype(int))
-    figure, axes = grid(len(views), images.titles)
-    for line, view in zip(axes, views, strict=True):
-        for axis, image in zip(line, images.row(view), strict=True):
-            axis.imshow(image)
+    """Draw samples.webp: views, each with the noisy training image, every method and the reference as displayed."""
+    lines = -(-len(images.titles) // _COLUMNS)
+    columns = -(-len(images.titles) // lines)
+    count = max(_LINES // lines, 1)
+    views = np.unique(np.linspace(0, len(images.reference) - 1, count).round().astype(int))
+    figure, axes = grid(len(views), images.titles, columns=columns, inches=_SAMPLE)
+    for row, view in zip(axes, views, strict=True):
+        for axis, image in zip(row, images.row(view), strict=True):
+            axis.imshow(image, interpolation="antialiased")  # 256x256 pixels have too little room
     save(figure, images.results.directory, "samples", PICTURE)
 
 

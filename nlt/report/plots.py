@@ -30,7 +30,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 PICTURE = ("webp",)  # the kind of file for a figure made of images; its lossy pixels are a sixth of a PNG's size
 _INCH, _LINE = 1.1, 0.12  # inches: an image of a grid, and a line of its title
-_TITLE = 20  # characters of such a line
+_TITLE = 20  # characters of such a line over an image of this size
 
 
 def style(number: int) -> dict[str, Any]:
@@ -83,17 +83,28 @@ def in_lines(name: str, characters: int) -> str:
     return "\n".join(textwrap.fill(line.replace("_", " "), characters) for line in broken.split("\n"))
 
 
-def grid(rows: int, columns: list[str], bottom: float = 0.02) -> tuple[plt.Figure, np.ndarray]:
-    """Return a figure for a grid of images with column titles, and its axes; `bottom` inches stay free."""
-    titles = [in_lines(name, _TITLE) for name in columns]
-    top = _LINE * (2 + max(title.count("\n") for title in titles))
-    size = (_INCH * len(columns), _INCH * rows + top + bottom)
-    figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
-    for axis in axes.flat:
+def grid(
+    rows: int, titles: list[str], bottom: float = 0.02, columns: int | None = None, inches: float = _INCH
+) -> tuple[plt.Figure, np.ndarray]:
+    """Return a figure for rows of titled images, and its axes (rows, images of a row); `bottom` inches stay free.
+
+    With `columns`, a row of more images is drawn in several lines, and every line has titles, else the first alone.
+    """
+    columns = min(columns or len(titles), len(titles))
+    lines = -(-len(titles) // columns)
+    texts = [in_lines(name, round(_TITLE * inches / _INCH)) for name in titles]
+    top = _LINE * (2 + max(text.count("\n") for text in texts))
+    titled = rows * lines if lines > 1 else 1
+    size = (inches * columns, inches * rows * lines + top * titled + bottom)
+    figure, all_axes = plt.subplots(rows * lines, columns, figsize=size, squeeze=False)
+    for axis in all_axes.flat:
         axis.set_axis_off()
-    for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(title, fontsize=7)
-    figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - top / size[1], 0.02, 0.02)
+    axes = all_axes.reshape(rows, -1)[:, : len(titles)]
+    for row in axes[:titled]:
+        for axis, text in zip(row, texts, strict=True):
+            axis.set_title(text, fontsize=7)
+    between = top / inches if lines > 1 else 0.02
+    figure.subplots_adjust(0.002, bottom / size[1], 0.998, 1 - top / size[1], 0.02, between)
     return figure, axes
 
 

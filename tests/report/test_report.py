@@ -170,6 +170,19 @@ def test_no_page_of_variants_without_any(tmp_path):
     assert not (tmp_path / "variants.md").exists()
 
 
+def test_a_row_of_many_images_is_drawn_in_lines():
+    """Nine images in lines of five: two lines for each of two rows, one below the other, all with titles."""
+    figure, axes = plots.grid(2, [f"method {k}" for k in range(9)], columns=5, inches=2)
+    assert axes.shape == (2, 9)
+    places = [[axis.get_position() for axis in row] for row in axes]
+    tops = [places[row][column].y1 for row in range(2) for column in (0, 5)]
+    bottoms = [places[row][column].y0 for row in range(2) for column in (0, 5)]
+    assert all(bottoms[k] > tops[k + 1] for k in range(3))
+    assert places[0][5].x0 == places[0][0].x0 and places[0][4].y0 == places[0][0].y0
+    assert [axis.get_title() for axis in axes[1]] == [f"method {k}" for k in range(9)]
+    assert figure.get_size_inches()[0] == 10
+
+
 def test_axes_of_speed_accuracy(tmp_path, monkeypatch):
     """Errors are logarithmic, so that a path-traced row does not press the others together; so is the time."""
     figures = []
@@ -668,6 +681,8 @@ def test_chart(open_report, stored):
         front = [m for m, (x, y) in points.items() if not any(s < x and t <= y for s, t in points.values())]
         listed = page.locator("#budget button").evaluate_all("buttons => buttons.map(b => b.dataset.method)")
         assert listed == sorted(front, key=seconds)
+    looks = page.evaluate("Array.from({ length: 49 }, (_, k) => look(k).colour + look(k).marker)")
+    assert len(set(looks)) == 49, "two families look the same"
     page.locator("#chart .point[data-method=cnn]").click()
     assert report.state()["a"] == "cnn" and page.evaluate("document.activeElement.id") == "stage"
     page.mouse.move(0, 0)

@@ -114,11 +114,13 @@ const MARKERS = [
   "M-5,0a5,5 0 1,0 10,0a5,5 0 1,0 -10,0Z", "M-4.5,-4.5h9v9h-9Z", "M0,-6L6,0L0,6L-6,0Z", "M0,-6L5.5,4.5H-5.5Z",
   "M0,6L5.5,-4.5H-5.5Z", "M-2,-5.5h4v3.5h3.5v4h-3.5v3.5h-4v-3.5h-3.5v-4h3.5Z", "M-6,0L4.5,-5.5V5.5Z",
 ];
+// A family's look; families of the same colour have different markers.
+const look = (k) => ({ colour: `var(--c${k % 7})`, marker: MARKERS[(k + Math.floor(k / 7)) % 7], dash: ["none", "6 3", "2 3"][k % 3] });
 const familyOf = (method) => method.curve ?? method.id;
 const families = [...new Set(data.methods.map(familyOf))];
 for (const method of data.methods) {
   const k = families.indexOf(familyOf(method));
-  Object.assign(method, { number: k + 1, colour: `var(--c${k % 7})`, marker: MARKERS[k % 7], dash: ["none", "6 3", "2 3"][k % 3] });
+  Object.assign(method, { number: k + 1, ...look(k) });
   method.short = method.curve ? method.setting : method.label;
 }
 
