@@ -110,7 +110,7 @@ def stress(
     if measured() != before:  # otherwise keep the manifest of the run that measured them
         write_record()
     section = stress_section(directory.parent)
-    if (directory.parent / VIEWS).exists():  # the report of `nlt compare` shows this section, too; a clone lacks views.csv
+    if (directory.parent / VIEWS).exists():  # which git does not keep; without it there is no report to extend
         results = load(directory.parent)
         write_page(results, write_claims(results), sections=[section])
     print(f"written to {directory}: {', '.join(sorted(path.name for path in directory.iterdir()))}")
