@@ -21,7 +21,7 @@ fixed_lights() {
 table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 peers="oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast oidn_4_balanced oidn_4"
-front="cnn@direct guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_narrow guided_4spp@direct
+front="cnn@direct cnn@direct_patches guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_patches guided_4spp@direct
     $peers path_tracing_1 path_tracing_4"
 # shellcheck disable=SC2086  # lists of methods
 if [ "$scale" = small ]; then

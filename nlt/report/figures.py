@@ -19,7 +19,7 @@ from nlt.report import plots
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 _CURVES = ("0.3", "#8C510A", "#000000")
 _LEARNING = ("mse", "mssim", "fid", "feature_l1", "flip")
-_LINE = 50  # characters of a panel's width, in the smallest print
+_LINE = 56  # characters of a panel's width, in the smallest print
 _MAX_PANELS = 4  # of the learning curves, per row
 _SHADES = (0.0, 0.65)  # of grey, for the first and the last method of a curve
 
@@ -58,19 +58,21 @@ def _points(results: Results, key: str) -> dict[str, tuple[float, float]]:
 
 def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[str, Sequence[str]]) -> None:
     """Draw a metric over time; `families` has the methods of each curve."""
-    points = _points(results, key)
-    if is_linear := METRICS[key].direction == "higher":
-        far = far_behind(results, key)
+    points, is_linear = _points(results, key), METRICS[key].direction == "higher"
+    if far := far_behind(results, key):
         points = {method: point for method, point in points.items() if method not in far}
-        words = f"not shown: {', '.join(map(label, far))}" if far else ""
-        axis.text(0.98, 0.03, textwrap.fill(words, _LINE), fontsize=6, ha="right", transform=axis.transAxes)
+        words = textwrap.fill(f"not shown: {', '.join(map(label, far))}", _LINE)
+        # Beyond the front there is nothing.
+        y, side = (0.97, "top") if is_linear else (0.03, "bottom")
+        axis.text(0.02, y, words, fontsize=6, va=side, transform=axis.transAxes)
     plots.draw_front(axis, points, METRICS[key].direction)
     for k, (name, members) in enumerate(families.items()):
         colour = _CURVES[k % len(_CURVES)]
         drawn = [method for method in members if method in points]
         entry, labels = _labels(name, members)
-        _plot(axis, results, key, {m: points[m] for m in drawn}, label=entry, color=colour, ls=plots.DASHES[k % 4],
-              marker="x+."[k % 3])  # fmt: skip
+        marker = "x+."[(k + k // len(_CURVES)) % 3]  # another for each curve of the same colour
+        dashes = plots.DASHES[k % len(plots.DASHES)]
+        _plot(axis, results, key, {m: points[m] for m in drawn}, label=entry, color=colour, ls=dashes, marker=marker)
         for number, m in enumerate(drawn):
             plots.annotate(axis, labels[m], points[m], -11 if number % 2 else 5, fontsize=7, color=colour, zorder=4)
     for k, m in enumerate(_alone(results, families)):
@@ -127,11 +129,14 @@ def curves(results: Results) -> dict[str, list[str]]:
 
 
 def far_behind(results: Results, key: str) -> list[str]:
-    """Return the methods that a linear axis leaves out, because they would press all others together.
+    """Return the methods that a chart leaves out, because they would press all others together.
 
-    They are four times as far below the best value of the metric `key` as the median method.
+    They are four times as far from the best value of the metric `key` as the median method, on a logarithmic axis if
+    lower is better.
     """
     values = {m: value for m in results.methods if math.isfinite(value := results.mean(m, key))}
+    if METRICS[key].direction == "lower":
+        values = {method: -math.log(value) for method, value in values.items() if value > 0}
     gaps = {method: max(values.values()) - value for method, value in values.items()}
     return [method for method, gap in gaps.items() if gap > 4 * np.median(list(gaps.values())) > 0]
 

@@ -149,7 +149,7 @@ def _quantities(results: Results) -> dict[str, dict[str, Any]]:
             "unit": quantity.unit,
             "role": "metric" if key in METRICS and key != "reference_noise" else "cost" if key in _AXES else "",
             "per_image": quantity.per_image,
-            "far": far_behind(results, key) if quantity.direction == "higher" else [],
+            "far": far_behind(results, key) if key in METRICS else [],
         }
         for key, quantity in QUANTITIES.items()
         if any(len(on.values(method, key)) for on in everywhere for method in results.methods)
