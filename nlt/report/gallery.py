@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
-from nlt.report.plots import PICTURE, grid, plt, save, shown
+from nlt.report.plots import PICTURE, PICTURE_DPI, grid, plt, save, shown
 from nlt.report.table_writer import Table, write_texts
 
 FAILURES = "failures.csv"
@@ -121,9 +121,10 @@ def draw_samples(images: Shown) -> None:
     count = max(_LINES // lines, 1)
     views = np.unique(np.linspace(0, len(images.reference) - 1, count).round().astype(int))
     figure, axes = grid(len(views), images.titles, columns=columns, inches=_SAMPLE)
+    has_room = images.reference.shape[1] < _SAMPLE * PICTURE_DPI
     for row, view in zip(axes, views, strict=True):
         for axis, image in zip(row, images.row(view), strict=True):
-            axis.imshow(image, interpolation="antialiased")  # 256x256 pixels have too little room
+            axis.imshow(image, interpolation="nearest" if has_room else "antialiased")
     save(figure, images.results.directory, "samples", PICTURE)
 
 

@@ -29,6 +29,7 @@ plt.rcParams.update({
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 MARKERS, DASHES = "osD^v*PX<>", ("-", "--", ":", "-.")
 PICTURE = ("webp",)  # the kind of file for a figure made of images; its lossy pixels are a sixth of a PNG's size
+PICTURE_DPI = 100
 _INCH, _LINE = 1.1, 0.12  # inches: an image of a grid, and a line of its title
 _TITLE = 20  # characters of such a line over an image of this size
 
@@ -121,7 +122,7 @@ def save(figure: plt.Figure, directory: Path, name: str, kinds: tuple[str, ...] 
     options: dict[str, dict[str, Any]] = {
         "png": {"dpi": 150, "metadata": {"Software": None}},
         "svg": {"dpi": 150, "metadata": {"Date": None}},
-        "webp": {"dpi": 100, "pil_kwargs": {"quality": 90, "method": 6}},
+        "webp": {"dpi": PICTURE_DPI, "pil_kwargs": {"quality": 90, "method": 6}},
     }
     for kind in kinds:
         file = directory / f"{name}.{kind}"
