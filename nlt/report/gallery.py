@@ -117,10 +117,8 @@ def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray,
 def draw_samples(images: Shown) -> None:
     """Draw samples.webp: views, each with the noisy training image, every method and the reference as displayed."""
     lines = -(-len(images.titles) // _COLUMNS)
-    columns = -(-len(images.titles) // lines)
-    count = max(_LINES // lines, 1)
-    views = np.unique(np.linspace(0, len(images.reference) - 1, count).round().astype(int))
-    figure, axes = grid(len(views), images.titles, columns=columns, inches=_SAMPLE)
+    views = np.unique(np.linspace(0, len(images.reference) - 1, max(_LINES // lines, 1)).round().astype(int))
+    figure, axes = grid(len(views), images.titles, lines=lines, inches=_SAMPLE)
     has_room = images.reference.shape[1] < _SAMPLE * PICTURE_DPI
     for row, view in zip(axes, views, strict=True):
         for axis, image in zip(row, images.row(view), strict=True):

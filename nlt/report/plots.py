@@ -85,14 +85,13 @@ def in_lines(name: str, characters: int) -> str:
 
 
 def grid(
-    rows: int, titles: list[str], bottom: float = 0.02, columns: int | None = None, inches: float = _INCH
+    rows: int, titles: list[str], bottom: float = 0.02, lines: int = 1, inches: float = _INCH
 ) -> tuple[plt.Figure, np.ndarray]:
     """Return a figure for rows of titled images, and its axes (rows, images of a row); `bottom` inches stay free.
 
-    With `columns`, a row of more images is drawn in several lines, and every line has titles, else the first alone.
+    A row is drawn in `lines`; if there are several, every line has titles, else the first row alone.
     """
-    columns = min(columns or len(titles), len(titles))
-    lines = -(-len(titles) // columns)
+    columns = -(-len(titles) // lines)
     texts = [in_lines(name, round(_TITLE * inches / _INCH)) for name in titles]
     top = _LINE * (2 + max(text.count("\n") for text in texts))
     titled = rows * lines if lines > 1 else 1

@@ -1,6 +1,7 @@
 """`nlt compare` over every method there is: its files, its numbers, and what it does when run again."""
 
 import csv
+import itertools
 import json
 import os
 import re
@@ -8,6 +9,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,7 +50,7 @@ from nlt.report import plots
 from nlt.report.dashboard import write_logs
 from nlt.report.draw import draw
 from nlt.report.figures import curves, draw_learning_curves
-from nlt.report.gallery import Shown, worst_pixels
+from nlt.report.gallery import Shown, draw_samples, worst_pixels
 
 pytest_plugins = ["training_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -313,31 +315,37 @@ def test_the_papers_figures_stand_beside_ours(world):
     assert "/" not in "".join(accuracy["extra"])
 
 
-def test_pictures(world):
+def test_pictures(world, tmp_path):
     """Of each view the noisy image, every method's and the reference, in lines of at most seven; nothing is black."""
-    image = np.asarray(Image.open(world.folder / "out/samples.webp").convert("RGB")) / 255
-    count, side = len(world.rows) + 2, 192
-    lines = -(-count // 7)
-    columns = -(-count // lines)
-    views = [0, 2] if lines == 3 else [0, 1, 2] if lines < 3 else [0]  # at most six lines in all, if one view has fewer
-    assert abs(image.shape[1] - side * columns) < 10
-    height = image.shape[0] / (len(views) * lines)  # of a line: its title and its images
     dataset = LightTransportDataset(world.tiny.dataset, DatasetSpec(**DATASET), "test", ())
 
-    def tile(row, number):
-        """The middle of a picture, without its borders."""
-        line, column = divmod(number, columns)
-        y, x = int((row * lines + line + 1) * height - side / 2), int((column + 0.5) * image.shape[1] / columns)
-        half = int(0.3 * side)
-        return image[y - half : y + half, x - half : x + half]
+    def check(file, count, views):
+        image = np.asarray(Image.open(file).convert("RGB")) / 255
+        side, lines = 192, -(-count // 7)
+        columns = -(-count // lines)
+        assert abs(image.shape[1] - side * columns) < 10
+        bottoms = np.linspace(0, image.shape[0], len(views) * lines + 1)[1:]  # of the lines
 
-    for i, view in enumerate(views):
-        batch = default_collate([dataset[view]])
-        for j in range(count):
-            assert 0.02 < tile(i, j).mean() < 0.98 and tile(i, j).std() > 0.005, (i, j)
-        for j, target in ((0, batch["noisy"]), (count - 1, (batch["reference_a"] + batch["reference_b"]) / 2)):
-            expected = shown(target, batch)[3:13, 3:13]
-            assert np.abs(tile(i, j).mean((0, 1)) - expected.mean((0, 1))).max() < 0.06, (i, j)
+        def tile(row, number):
+            """The middle of a picture, without its borders."""
+            line, column = divmod(number, columns)
+            y, x = int(bottoms[row * lines + line] - side / 2), int((column + 0.5) * image.shape[1] / columns)
+            half = int(0.3 * side)
+            return image[y - half : y + half, x - half : x + half]
+
+        for i, view in enumerate(views):
+            batch = default_collate([dataset[view]])
+            for j in range(count):
+                assert 0.02 < tile(i, j).mean() < 0.98 and tile(i, j).std() > 0.005, (i, j)
+            for j, target in ((0, batch["noisy"]), (count - 1, (batch["reference_a"] + batch["reference_b"]) / 2)):
+                expected = shown(target, batch)[3:13, 3:13]
+                assert np.abs(tile(i, j).mean((0, 1)) - expected.mean((0, 1))).max() < 0.06, (i, j)
+
+    check(world.folder / "out/samples.webp", len(world.rows) + 2, [0])  # so many lines that one view is drawn
+    images = Shown.load(load(world.folder / "out"))
+    few = dict(itertools.islice(images.methods.items(), 8))
+    draw_samples(replace(images, results=replace(images.results, directory=tmp_path), methods=few))
+    check(tmp_path / "samples.webp", len(few) + 2, [0, 1, 2])
     curves = np.asarray(Image.open(world.folder / "out/speed_accuracy.png").convert("RGB"))
     assert curves.shape[1] > curves.shape[0] > 300 and curves.std() > 5
 

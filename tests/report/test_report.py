@@ -171,8 +171,8 @@ def test_no_page_of_variants_without_any(tmp_path):
 
 
 def test_a_row_of_many_images_is_drawn_in_lines():
-    """Nine images in lines of five: two lines for each of two rows, one below the other, all with titles."""
-    figure, axes = plots.grid(2, [f"method {k}" for k in range(9)], columns=5, inches=2)
+    """Nine images in two lines of five places, for each of two rows: one below the other, all with titles."""
+    figure, axes = plots.grid(2, [f"method {k}" for k in range(9)], lines=2, inches=2)
     assert axes.shape == (2, 9)
     places = [[axis.get_position() for axis in row] for row in axes]
     tops = [places[row][column].y1 for row in range(2) for column in (0, 5)]
