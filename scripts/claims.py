@@ -13,7 +13,12 @@ from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-TITLES = {"table1": "Claims on Table 1", "table2": "Claims on Table 2", "ablation": "Claims on the ablation"}
+TITLES = {
+    "table1": "Claims on Table 1",
+    "table2": "Claims on Table 2",
+    "ablation": "Claims on the ablation",
+    "static": "Claims on static rooms",
+}
 
 
 def tables() -> str:
@@ -21,6 +26,8 @@ def tables() -> str:
     text = []
     for table, title in TITLES.items():
         folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table) and _verdicts(folder)]
+        if not folders:
+            continue
         verdicts = {folder: _verdicts(folder) for folder in folders}
         claims = [claim["id"] for claim in claims_of(table)]
         rows = [[claim, *(verdicts[folder].get(claim, "") for folder in folders)] for claim in claims]
