@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter
 from nlt.errors import UserError
 from nlt.evaluation.paper import label
 from nlt.evaluation.results import Results, read_rows, write_rows
-from nlt.report.plots import PICTURE, PICTURE_DPI, grid, plt, save, shown
+from nlt.report.plots import PICTURE, PICTURE_DPI, grid, in_lines, plt, save, shown
 from nlt.report.table_writer import Table, write_texts
 
 FAILURES = "failures.csv"
@@ -127,29 +127,36 @@ def draw_samples(images: Shown) -> None:
 
 
 def draw_qualitative(images: Shown) -> None:
-    """Draw qualitative.webp: each view's images, an inset where trained methods err most, and error maps."""
+    """Draw qualitative.webp: all methods in a few views, with an inset where trained ones err most, and errors."""
     trained = [m for m in images.methods if np.isfinite(images.results.mean(m, "train_s"))] or list(images.methods)
     errors = {m: images.error(m) for m in images.methods}
     size = images.reference.shape[1]
     side = max(size // _INSET, 4)
     views = np.unique(np.linspace(0, len(images.reference) - 1, _VIEWS).round().astype(int))
-    figure, axes = grid(3 * len(views), images.titles)
+    figure, axes = grid(len(images.titles), ["Image", "Inset", "Error"] * len(views))
     for k, view in enumerate(views):
         mean = uniform_filter(np.mean([errors[m][view] for m in trained], axis=0), side, mode="nearest")
         inside = mean[side // 2 : size - side // 2, side // 2 : size - side // 2]
         top, left = np.unravel_index(inside.argmax(), inside.shape)
         crop = (slice(top, top + side), slice(left, left + side))
-        for whole, inset, image in zip(axes[3 * k], axes[3 * k + 1], images.row(view), strict=True):
+        own = axes[:, 3 * k : 3 * k + 3]
+        for (whole, inset, _), image in zip(own, images.row(view), strict=True):
             whole.imshow(image)
             whole.add_patch(plt.Rectangle((left - 0.5, top - 0.5), side, side, fill=False, ec="#D55E00", lw=0.8))
             inset.imshow(image[crop])
-        for column, method in enumerate(images.methods, 1):
-            drawn = axes[3 * k + 2][column].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
-    bar = axes[-1][-1].inset_axes((0.1, 0.1, 0.15, 0.8))
-    figure.colorbar(drawn, cax=bar).ax.tick_params(labelsize=5)
-    axes[-1][-1].text(0.65, 0.5, "error, same scale", fontsize=5, rotation=90, va="center", ha="center",
-                      transform=axes[-1][-1].transAxes)  # fmt: skip
+        for row, method in zip(own[1:], images.methods, strict=False):
+            drawn = row[2].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
+    for row, title in zip(axes, images.titles, strict=True):
+        _name(row[0], title)
+    figure.colorbar(drawn, cax=axes[0][2].inset_axes((0.1, 0.1, 0.15, 0.8))).ax.tick_params(labelsize=5)
     save(figure, images.results.directory, "qualitative", PICTURE)
+
+
+def _name(axis: plt.Axes, method: str) -> None:
+    """Write a method's name into the corner of its image."""
+    box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 1}
+    text = in_lines(method, 18)
+    axis.text(0.02, 0.98, text, color="white", fontsize=5, va="top", bbox=box, transform=axis.transAxes)
 
 
 def worst_pixels(images: Shown, method: str) -> np.ndarray:
@@ -165,24 +172,27 @@ def draw_failures(images: Shown) -> None:
     colour of the first cause that applies.
     """
     rows = []
-    figure, axes = grid(4, [label(m) for m in images.methods], bottom=0.3)
+    figure, axes = grid(
+        len(images.methods), ["Prediction", "Reference", "Error", "Worst pixels"], bottom=0.45, inches=_SAMPLE
+    )
     colours = np.array([matplotlib.colors.to_rgb(colour) for colour in CAUSES.values()])
     first = np.argmax([images.causes[cause] for cause in CAUSES], axis=0)
-    for column, method in enumerate(images.methods):
+    for row, method in zip(axes, images.methods, strict=True):
         worst = worst_pixels(images, method)
         view = int(worst.sum((1, 2)).argmax())
         overlay = np.where(worst[view][..., None], colours[first[view]], 0.25 * images.reference[view])
         error = images.error(method)[view]
         pictures = (images.methods[method][view], images.reference[view], error, overlay)
-        for axis, picture in zip(axes[:, column], pictures, strict=True):
+        for axis, picture in zip(row, pictures, strict=True):
             axis.imshow(picture, cmap="magma", vmin=0, vmax=images.scale)
+        _name(row[0], label(method))
         for cause, mask in images.causes.items():
             rows.append({
                 "method": method, "cause": cause, "pixels": int((worst & mask).sum()),
                 "share_of_worst": float(mask[worst].mean()) if worst.any() else 0.0, "share_of_all": float(mask.mean()),
             })  # fmt: skip
     handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in CAUSES.values()]
-    figure.legend(handles, CAUSES, loc="lower center", ncols=len(CAUSES), fontsize=7, frameon=False)
+    figure.legend(handles, CAUSES, loc="lower center", ncols=3, fontsize=7, frameon=False)
     save(figure, images.results.directory, "failures", PICTURE)
     write_rows(images.results.directory / FAILURES, rows)
     table = failures(images.results)
