@@ -19,7 +19,7 @@ from nlt.report import plots
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 _CURVES = ("0.3", "#8C510A", "#000000")
 _LEARNING = ("mse", "mssim", "fid", "feature_l1", "flip")
-_LINE = 56  # characters of a panel's width, in the smallest print
+_LINE = 40  # characters of the smallest print that take two thirds of a panel
 _MAX_PANELS = 4  # of the learning curves, per row
 _SHADES = (0.0, 0.65)  # of grey, for the first and the last method of a curve
 
