@@ -154,7 +154,7 @@ def draw_qualitative(images: Shown) -> None:
 
 def _name(axis: plt.Axes, method: str) -> None:
     """Write a method's name into the corner of its image."""
-    box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 1}
+    box = {"facecolor": "black", "alpha": 0.8, "linewidth": 0, "pad": 1}
     text = in_lines(method, 18)
     axis.text(0.02, 0.98, text, color="white", fontsize=5, va="top", bbox=box, transform=axis.transAxes)
 
