@@ -72,6 +72,9 @@ if [ "$scale" = small ]; then
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
     once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
     once nlt compare --config static_kitchen_real --seeds 3 --workers "${WORKERS:-2}" --out results/static_kitchen
+    once nlt compare --config static_bathroom_real --workers "${WORKERS:-2}" --out results/static_bathroom \
+        --methods cnn@direct feature_projection nlt guided_1spp@direct oidn_1_balanced oidn_1 oidn_4 path_tracing_1 \
+        path_tracing_4 path_tracing_16
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \
