@@ -8,32 +8,25 @@ import re
 from pathlib import Path
 from typing import Any
 
+from nlt.evaluation import paper
 from nlt.evaluation.claims import claims_of
 from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-TITLES = {
-    "table1": "Claims on Table 1",
-    "table2": "Claims on Table 2",
-    "ablation": "Claims on the ablation",
-    "static": "Claims on static rooms",
-}
 
 
 def tables() -> str:
     """Return a table for each of the paper's tables, in Markdown."""
     text = []
-    for table, title in TITLES.items():
+    for table in paper.tables():
         folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table) and _verdicts(folder)]
-        if not folders:
-            continue
         verdicts = {folder: _verdicts(folder) for folder in folders}
         claims = [claim["id"] for claim in claims_of(table)]
         rows = [[claim, *(verdicts[folder].get(claim, "") for folder in folders)] for claim in claims]
         holding = [f"{sum('holds' in v for v in verdicts[f].values())} of {len(verdicts[f])}" for f in folders]
         rows.append(["**hold**", *holding])
-        text += grid([title, *map(_heading, folders)], rows, numbers=False)
+        text += grid([f"Claims: {paper.paper()[table]['title']}", *map(_heading, folders)], rows, numbers=False)
     return "\n".join(text).strip()
 
 

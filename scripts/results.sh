@@ -71,8 +71,9 @@ if [ "$scale" = small ]; then
     once nlt stress --config demo --out results/trainings_builtin --suites training \
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
     once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
-    once nlt compare --config static_kitchen_real --seeds 3 --workers "${WORKERS:-2}" --out results/static_kitchen
-    once nlt compare --config static_bathroom_real --workers "${WORKERS:-2}" --out results/static_bathroom \
+    once nlt compare --config static_kitchen_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
+        --out results/static_kitchen
+    once nlt compare --config static_bathroom_real_demodulated --workers "${WORKERS:-2}" --out results/static_bathroom \
         --methods cnn@direct feature_projection nlt guided_1spp@direct oidn_1_balanced oidn_1 oidn_4 path_tracing_1 \
         path_tracing_4 path_tracing_16
     room --config other_rooms --scale medium --out results/other_rooms

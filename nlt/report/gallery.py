@@ -60,6 +60,10 @@ class Shown:
         """The titles of the images of a `row`."""
         return ["Training image", *map(label, self.methods), "Reference"]
 
+    def spread(self, count: int) -> np.ndarray:
+        """Return the numbers of `count` views from the first to the last, or of all if there are fewer."""
+        return np.unique(np.linspace(0, len(self.reference) - 1, count).round().astype(int))
+
     def row(self, view: int) -> list[np.ndarray]:
         """Return the training image, every method's image and the reference of a view, (H, W, 3) each."""
         return [self.noisy[view], *(images[view] for images in self.methods.values()), self.reference[view]]
@@ -117,7 +121,7 @@ def _shadow_edges(luminance: np.ndarray, albedo: np.ndarray, normal: np.ndarray,
 def draw_samples(images: Shown) -> None:
     """Draw samples.webp: views, each with the noisy training image, every method and the reference as displayed."""
     lines = -(-len(images.titles) // _COLUMNS)
-    views = np.unique(np.linspace(0, len(images.reference) - 1, max(_LINES // lines, 1)).round().astype(int))
+    views = images.spread(max(_LINES // lines, 1))
     figure, axes = grid(len(views), images.titles, lines=lines, inches=_SAMPLE)
     has_room = images.reference.shape[1] < _SAMPLE * PICTURE_DPI
     for row, view in zip(axes, views, strict=True):
@@ -132,7 +136,7 @@ def draw_qualitative(images: Shown) -> None:
     errors = {m: images.error(m) for m in images.methods}
     size = images.reference.shape[1]
     side = max(size // _INSET, 4)
-    views = np.unique(np.linspace(0, len(images.reference) - 1, _VIEWS).round().astype(int))
+    views = images.spread(_VIEWS)
     figure, axes = grid(len(images.titles), ["Image", "Inset", "Error"] * len(views))
     for k, view in enumerate(views):
         mean = uniform_filter(np.mean([errors[m][view] for m in trained], axis=0), side, mode="nearest")
@@ -144,7 +148,7 @@ def draw_qualitative(images: Shown) -> None:
             whole.imshow(image)
             whole.add_patch(plt.Rectangle((left - 0.5, top - 0.5), side, side, fill=False, ec="#D55E00", lw=0.8))
             inset.imshow(image[crop])
-        for row, method in zip(own[1:], images.methods, strict=False):
+        for row, method in zip(own[1:-1], images.methods, strict=True):
             drawn = row[2].imshow(errors[method][view], cmap="magma", vmin=0, vmax=images.scale)
     for row, title in zip(axes, images.titles, strict=True):
         _name(row[0], title)

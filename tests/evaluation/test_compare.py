@@ -346,6 +346,14 @@ def test_pictures(world, tmp_path):
     few = dict(itertools.islice(images.methods.items(), 8))
     draw_samples(replace(images, results=replace(images.results, directory=tmp_path), methods=few))
     check(tmp_path / "samples.webp", len(few) + 2, [0, 1, 2])
+    rows = np.asarray(Image.open(world.folder / "out/qualitative.webp").convert("RGB")) / 255
+    assert rows.shape[1] == pytest.approx(110 * 3 * 3, abs=10)  # image, inset and error of each view
+    assert rows.shape[0] == pytest.approx(110 * (len(world.rows) + 2), abs=50)
+    for view in range(3):
+        batch = default_collate([dataset[view]])
+        expected = shown((batch["reference_a"] + batch["reference_b"]) / 2, batch)[3:13, 3:13]
+        tile = rows[-90:-22, 330 * view + 22 : 330 * view + 90]  # in the last row
+        assert np.abs(tile.mean((0, 1)) - expected.mean((0, 1))).max() < 0.06, view
     curves = np.asarray(Image.open(world.folder / "out/speed_accuracy.png").convert("RGB"))
     assert curves.shape[1] > curves.shape[0] > 300 and curves.std() > 5
 
