@@ -19,7 +19,7 @@ from nlt.report import plots
 _PANELS = ("mssim", "fid", *(f"feature_l1_layer{k}" for k in range(4)), "mse", "flip")
 _CURVES = ("0.3", "#8C510A", "#000000")
 _LEARNING = ("mse", "mssim", "fid", "feature_l1", "flip")
-_LINE = 40  # characters of the smallest print that take two thirds of a panel
+_LINE = 56  # characters of a panel's width, in the smallest print
 _MAX_PANELS = 4  # of the learning curves, per row
 _SHADES = (0.0, 0.65)  # of grey, for the first and the last method of a curve
 
@@ -58,13 +58,11 @@ def _points(results: Results, key: str) -> dict[str, tuple[float, float]]:
 
 def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[str, Sequence[str]]) -> None:
     """Draw a metric over time; `families` has the methods of each curve."""
-    points, is_linear = _points(results, key), METRICS[key].direction == "higher"
+    points, is_linear, notes = _points(results, key), METRICS[key].direction == "higher", []
     if far := far_behind(results, key):
         points = {method: point for method, point in points.items() if method not in far}
-        words = textwrap.fill(f"not shown: {', '.join(map(label, far))}", _LINE)
-        # Beyond the front there is nothing.
-        y, side = (0.97, "top") if is_linear else (0.03, "bottom")
-        axis.text(0.02, y, words, fontsize=6, va=side, transform=axis.transAxes)
+        notes = textwrap.wrap(f"not shown: {', '.join(map(label, far))}", _LINE)
+        axis.text(0, 1.01, "\n".join(notes), fontsize=6, va="bottom", transform=axis.transAxes)
     plots.draw_front(axis, points, METRICS[key].direction)
     for k, (name, members) in enumerate(families.items()):
         colour = _CURVES[k % len(_CURVES)]
@@ -82,7 +80,7 @@ def _draw_panel(axis: plt.Axes, results: Results, key: str, families: Mapping[st
         axis.set_yscale("log")
         _set_ticks(axis.yaxis)
     axis.margins(0.09, 0.12)
-    axis.set_title(heading(key))
+    axis.set_title(heading(key), pad=5 + 8 * len(notes))
 
 
 def _plot(
