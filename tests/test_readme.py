@@ -176,7 +176,7 @@ def test_make():
 def test_recipes(sandbox, monkeypatch, capsys):
     """Commands and files of CONTRIBUTING: a scene of one's own is checked, described, shown and rendered; a method of
     one's own is trained."""
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)  # what it will take, which it tries out
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)  # what it will take, which it tries out
     for command, smaller in RUN.items():
         assert main(shlex.split(f"{command} {smaller}")[1:]) == 0, command
     assert load_description("room").file == Path("scenes/room.yaml")

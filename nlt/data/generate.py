@@ -29,6 +29,7 @@ SAMPLES_PER_JOB = 1024
 # Number of pilot views per scene, and samples per pixel of each half of a pilot reference.
 PILOT_VIEWS, PILOT_SPP = 4, 32
 TIMED_SPP = 8  # most samples per pixel of a reference that is only timed
+_BAR = "{l_bar}{bar}| [{elapsed}<{remaining}]"  # no counts, because samples differ in cost
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,9 @@ def generate(
     write_manifest(directory, spec, f"{variant.name}: {variant.reason}")
     print(f"rendering with {variant.name}: {variant.reason}", flush=True)
     _choose_reference_spp(spec, directory, missing)
-    _announce(spec, directory, _shards(spec, missing), engine, size)
-    _run(spec, directory, engine, partial(_render, spec, str(directory), variant.name))
+    evaluated = _announce(spec, directory, _shards(spec, missing), engine, size)
+    cost = {split: 1 if split == "train" else evaluated for split in SPLITS}
+    _run(spec, directory, engine, partial(_render, spec, str(directory), variant.name, cost), cost)
     return directory
 
 
@@ -155,9 +157,13 @@ def _check_space(spec: DatasetSpec, directory: AnyPath, missing: list[str]) -> s
     return f"{size / 1e9:.2f} GB of {free / 1e9:.0f} GB free"
 
 
-def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine, cost: str) -> None:
-    """Print the number of samples, their size (`cost`) and the expected time."""
+def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine: Engine, size: str) -> int:
+    """Print the number of samples, their size and the expected time.
+
+    Return how many training samples take as long as one evaluated sample, or 1 if no time was measured.
+    """
     samples = {split: sum(s.size for s in shards if s.split == split) for split in SPLITS}
+    ratio = 1
     if isinstance(engine, Local):  # other machines may be faster or slower
         try:
             mean = round(np.mean([reference["spp"] for reference in references(directory, spec)]))
@@ -165,8 +171,10 @@ def _announce(spec: DatasetSpec, directory: AnyPath, shards: list[Shard], engine
         except Died as error:
             raise UserError(f"the renderer crashed in a trial run ({error})") from None
         seconds = (samples["train"] * train + (samples["val"] + samples["test"]) * evaluated) / engine.workers
-        cost += f", about {seconds / 60:.1f} min"
-    print(f"{directory}: {sum(samples.values())} samples to render, {engine.workers} at a time, {cost}", flush=True)
+        size += f", about {seconds / 60:.1f} min"
+        ratio = max(1, round(evaluated / train))
+    print(f"{directory}: {sum(samples.values())} samples to render, {engine.workers} at a time, {size}", flush=True)
+    return ratio
 
 
 def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
@@ -184,12 +192,13 @@ def plan(spec: DatasetSpec, missing: list[str], workers: int) -> list[Job]:
     return jobs
 
 
-def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) -> None:
-    remaining = lambda: sum(shard.size for shard in _shards(spec, missing_files(directory, spec)))
+def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable, cost: Mapping[str, int]) -> None:
+    """Run `work` on all jobs; the progress bar counts `cost` for each sample of a split, so that its ETA is right."""
+    remaining = lambda: sum(shard.size * cost[shard.split] for shard in _shards(spec, missing_files(directory, spec)))
     total, failures = remaining(), dict[Job, str]()
     jobs = plan(spec, missing_files(directory, spec), engine.workers)
     with (
-        tqdm(total=total, unit="sample", desc="rendering", file=sys.stderr, mininterval=1.0) as bar,
+        tqdm(total=total, bar_format=_BAR, desc="rendering", file=sys.stderr, mininterval=1.0, smoothing=0) as bar,
         closing(engine.run(work, jobs, failures)) as ticks,
     ):
         for ticked in ticks:
@@ -201,32 +210,40 @@ def _run(spec: DatasetSpec, directory: AnyPath, engine: Engine, work: Callable) 
         raise UserError(f"{directory}: {missing[0]} is still missing; check that all machines see this directory")
 
 
-def _render(spec: DatasetSpec, place: str, variant: str, job: Job, threads: int, tick: Callable[[int], None]) -> None:
-    """Run a job in its own process."""
+def _render(
+    spec: DatasetSpec,
+    place: str,
+    variant: str,
+    cost: Mapping[str, int],
+    job: Job,
+    threads: int,
+    tick: Callable[[int], None],
+) -> None:
+    """Run a job in its own process; `tick` counts the `cost` of every sample."""
     os.environ["NLT_VARIANT"] = variant  # every machine must use the same one
     directory = open_path(place)
     spec.reference_spp = references(directory, spec)[job.scene]["spp"]  # this process has its own spec
-    fill(SampleRenderer(spec, job.scene, threads), directory, job, tick)
+    fill(SampleRenderer(spec, job.scene, threads), directory, job, lambda split, n: tick(n * cost[split]))
 
 
-def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[int], None]) -> None:
-    """Render and write the files of a job; `tick(n)` is called after every n samples."""
+def fill(render: SampleRenderer, directory: AnyPath, job: Job, tick: Callable[[str, int], None]) -> None:
+    """Render and write the files of a job; `tick(split, n)` is called after every n samples of a split."""
     if job.needs_points:
         write_shard(directory / points_name(job.scene), [render.points()])
     for shard in job.shards:
         path = directory / shard.name
         if path.exists():  # another run has rendered it
-            tick(shard.size)
+            tick(shard.split, shard.size)
         else:
             render_shard(render, path, shard, tick)
 
 
-def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Callable[[int], None]) -> None:
+def render_shard(render: SampleRenderer, path: AnyPath, shard: Shard, tick: Callable[[str, int], None]) -> None:
     """Render and write the samples of a shard."""
     samples = []
     for index in range(shard.start, shard.stop):
         samples.append(render.sample(shard.split, index))
-        tick(1)
+        tick(shard.split, 1)
     write_shard(path, samples)
 
 

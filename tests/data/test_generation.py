@@ -49,6 +49,24 @@ def test_same_bytes_twice(dataset, tmp_path):
     assert spec_of(seed=1).directory("x") != spec_of().directory("x")
 
 
+def test_progress_counts_what_samples_cost(tmp_path, monkeypatch):
+    """The workers count a reference as often as it is slower than a training sample, and so does the bar's total."""
+    bars, steps = [], []
+
+    class Bar(generation.tqdm):
+        def update(self, n=1):
+            bars.append(self)
+            steps.append(n)
+            super().update(n)
+
+    monkeypatch.setattr(generation, "tqdm", Bar)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 7)
+    spec = spec_of()
+    generate(spec, tmp_path, workers=1)
+    assert bars[0].total == spec.train + 7 * (spec.val + spec.test) == sum(steps)
+    assert steps[-1] == 0, "what the workers counted is the total"
+
+
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -161,14 +179,14 @@ def test_chosen_once(piloted, tmp_path, monkeypatch):
     assert set(content(directory)) == {"manifest.json", "pilot-000.json"}
     with monkeypatch.context() as patch:
         patch.setattr(generation, "_pilot", _no_pilot)
-        patch.setattr(generation, "_announce", lambda *_: None)
+        patch.setattr(generation, "_announce", lambda *_: 1)
         generate(spec, tmp_path, workers=2)
     assert content(directory) == content(piloted)
     (directory / "pilot-000.json").unlink()
     with pytest.raises(UserError, match=r"incomplete, 1 files missing, such as pilot-000.json"):
         store.check_dataset(directory, spec)
     monkeypatch.setattr(generation, "_run", lambda *_: None)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     generate(spec, tmp_path, workers=1)
     assert content(directory) == content(piloted)
 
@@ -198,7 +216,7 @@ RUN = f"""if __name__ == "__main__":
     import sys
     from nlt.data import generate as generation
     from nlt.data.spec import DatasetSpec
-    generation._announce = lambda *_: None
+    generation._announce = lambda *_: 1
     generation.generate(DatasetSpec(sys.argv[2:], **{LONG!r}), sys.argv[1], workers=2)
 """
 
@@ -261,14 +279,14 @@ def test_sixteen_shards_survive(tmp_path):
 _render = generation._render
 
 
-def _killed_once(spec, directory, variant, job, *rest):
+def _killed_once(spec, directory, variant, cost, job, *rest):
     """Kill the worker once, after its first shard."""
     marker = Path(directory).parent / "killed"
     if not marker.exists():
         marker.touch()
-        _render(spec, directory, variant, generation.Job(job.scene, job.shards[:1], False), *rest)
+        _render(spec, directory, variant, cost, generation.Job(job.scene, job.shards[:1], False), *rest)
         os.kill(os.getpid(), signal.SIGKILL)
-    _render(spec, directory, variant, job, *rest)
+    _render(spec, directory, variant, cost, job, *rest)
 
 
 def _always_killed(*_):
@@ -290,14 +308,14 @@ def test_workers_have_equally_many_jobs(scenes, workers):
 
 def test_killed_worker(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_render", _killed_once)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     assert content(generate(spec_of(), tmp_path, workers=1)) == content(dataset)
     assert (tmp_path / "killed").exists()
 
 
 def test_worker_killed_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "_render", _always_killed)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     with pytest.raises(UserError, match=r"living_room.*worker died twice"):
         generate(spec_of(), tmp_path, workers=1)
 
@@ -353,15 +371,15 @@ def test_no_kernel_is_compiled_anew(experiment):
 # ---- clusters -------------------------------------------------------------------------------------------
 
 
-def _kills_its_dask_worker(spec, directory, variant, job, *rest):
+def _kills_its_dask_worker(spec, directory, variant, cost, job, *rest):
     """Kill the Dask worker, which is the parent of the job's process, once after the first shard."""
     marker = Path(directory).parent / "killed"
     if not marker.exists():
-        _render(spec, directory, variant, generation.Job(job.scene, job.shards[:1], False), *rest)
+        _render(spec, directory, variant, cost, generation.Job(job.scene, job.shards[:1], False), *rest)
         with suppress(FileExistsError), marker.open("x"):
             os.kill(os.getppid(), signal.SIGKILL)
             time.sleep(0.5)
-    _render(spec, directory, variant, job, *rest)
+    _render(spec, directory, variant, cost, job, *rest)
 
 
 @pytest.fixture(scope="module")
@@ -394,7 +412,7 @@ def _mistaken(*_):
 @pytest.mark.parametrize("where", ["local", "dask", "slurm-local"])
 def test_mistake_far_away(where, tmp_path, monkeypatch, request, elsewhere):
     monkeypatch.setattr(generation, "_render", _mistaken)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     scheduler = request.getfixturevalue("cluster").scheduler_address if where == "dask" else where
     with pytest.raises(UserError, match=r"^scene.yaml: objects: wrong$"):
         generate(spec_of(), tmp_path, workers=1, scheduler=scheduler)
@@ -414,7 +432,7 @@ def test_slurm_script(tmp_path, monkeypatch, elsewhere):
         (tmp_path / name).write_text("#!/bin/sh\ncat $1 > given; echo no such partition >&2; exit 1\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     with pytest.raises(UserError, match=r"--slurm: .*slurm_nope"):
         generate(spec_of(), tmp_path, scheduler="slurm", slurm={"nope": "1"})
     options = {"partition": "gpu", "time": "60", "cpus_per_task": "4"}
@@ -451,7 +469,7 @@ def test_missing_extra(scheduler, package, monkeypatch):
 def test_files_that_nobody_sees(tmp_path, monkeypatch):
     """Generation reports that the files of workers with a disk of their own are missing."""
     monkeypatch.setattr(generation, "_render", _writes_nothing)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     with pytest.raises(UserError, match=r"is still missing; check that all machines see this directory"):
         generate(spec_of(), tmp_path, workers=1)
 
@@ -517,7 +535,7 @@ def test_remote(remote, dataset, tmp_path, monkeypatch):
     copy.unlink()
     with pytest.raises(UserError, match=r"remote://.*: missing shard"):
         store.ShardReader().read(shard, 0, fields)
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     generate(spec_of(), remote, workers=1)
     assert {names[name]: data for name, data in content(objects).items()} == content(dataset)
 
@@ -559,7 +577,7 @@ def _fills_the_disk(*arguments):
 
 
 def test_full_disk_on_the_way(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(generation, "_announce", lambda *_: None)
+    monkeypatch.setattr(generation, "_announce", lambda *_: 1)
     with monkeypatch.context() as patch:
         patch.setattr(generation, "_render", _fills_the_disk)
         with pytest.raises(UserError, match=r"no space left on disk"):
