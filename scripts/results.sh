@@ -70,7 +70,8 @@ if [ "$scale" = small ]; then
         guided_1spp_relative@direct_corrected oidn_1 oidn_4
     once nlt stress --config demo --out results/trainings_builtin --suites training \
         --methods denoising_1_1 cnn feature_projection nlt nlt_photons guided_1spp@direct_corrected
-    once nlt compare --config ablation_real --scale demo --seeds 3 --workers "${WORKERS:-2}" --out results/ablation_egg
+    once nlt compare --config ablation_real --scale ablation_128 --seeds 3 --workers "${WORKERS:-2}" \
+        --out results/ablation_egg
     once nlt compare --config static_kitchen_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
         --out results/static_kitchen
     once nlt compare --config static_bathroom_real_demodulated --workers "${WORKERS:-2}" --out results/static_bathroom \
