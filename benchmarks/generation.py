@@ -64,7 +64,7 @@ def contest(spec: DatasetSpec, rounds: int, barrier: Any, folder: str) -> dict[s
                     loop.sample(state, camera, shard.split, shard.start + k)
 
             def ours(shard: Shard = shard) -> None:
-                render_shard(render, Path(folder) / f"{id(render)}.safetensors", shard, lambda _: None)
+                render_shard(render, Path(folder) / f"{id(render)}.safetensors", shard, lambda *_: None)
 
             turns: dict[str, Callable[[], None]] = {who: partial(plain, loop) for who, loop in bare.items()}
             turns["generation"] = ours

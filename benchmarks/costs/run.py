@@ -226,7 +226,7 @@ class Benchmark:
         spec = self._sized(settings, -(-count // len(self.spec.scenes)))
         directory = spec.directory(self.work / _SAMPLES_FOLDER)
         for job in plan(spec, missing_files(directory, spec), 1):
-            fill(self.renderer(spec, job.scene), directory, job, lambda _: None)
+            fill(self.renderer(spec, job.scene), directory, job, lambda *_: None)
         write_manifest(directory, spec, choose_variant().name)
         return LightTransportDataset(directory, spec, "train")
 
