@@ -23,9 +23,9 @@ from nlt.errors import UserError
 from nlt.waiting import as_the_user_said
 
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # "quota period" in microseconds, or "max period"
-# work(job, threads, tick) does a job with the given number of threads and calls tick(n) after every n samples.
+# work(job, threads, tick) does a job with the given number of threads; tick(n) adds n to the progress that is shown.
 Work = Callable[[Any, int, Callable[[int], None]], None]
-# An engine regularly yields the number of samples finished so far, or None if it cannot know.
+# An engine regularly yields the sum of all ticks so far, or None if it cannot know.
 Ticks = Generator[int | None, None, None]
 _CONTEXT = multiprocessing.get_context("spawn")
 _POLL, _CONNECT = 1.0, 20.0  # seconds
@@ -78,7 +78,7 @@ class Engine(ABC):
         """Start jobs and return their futures, which have `done`, `result` and `cancel`."""
 
     def _wait(self, running: Iterable[Any]) -> int | None:
-        """Wait a moment and return the number of samples finished so far, or None."""
+        """Wait a moment and return the sum of all ticks so far, or None."""
         time.sleep(_POLL)
         return None
 
@@ -210,10 +210,10 @@ def _work(content: bytes, threads: int, counter: Any) -> None:
     multiprocessing.current_process().daemon = False  # a daemon may not start processes, as data loaders do
     multiprocessing.set_start_method(None, force=True)  # otherwise data loaders inherit our slow start method
 
-    def tick(samples: int) -> None:
+    def tick(progress: int) -> None:
         if not parent.is_alive():
             os._exit(1)  # the parent was killed, so nobody needs the result
-        counter.value += samples
+        counter.value += progress
 
     work(job, threads, tick)
 
