@@ -39,6 +39,8 @@ if [ "$scale" = small ]; then
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --workers "${WORKERS:-2}" \
         --out results/builtin_fixed_lights --methods $table2 cnn@direct
+    once nlt compare --config table1_real_demodulated --data builtin_fixed_lights --scale small_four_rooms \
+        --workers "${WORKERS:-2}" --out results/four_rooms_fixed_lights --methods denoising_1_1 cnn oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table2_real_demodulated --data demo --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights --methods $table2 cnn@direct guided_1spp@direct_corrected
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
