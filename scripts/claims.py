@@ -13,6 +13,7 @@ from nlt.evaluation.claims import claims_of
 from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
+COMMON = {"64x64", "width 16", "demodulated", "25,600 images", "1 trainings"}  # docs/paper-tables.md names them
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
@@ -53,13 +54,15 @@ def _verdicts(folder: Path) -> dict[str, str]:
 
 
 def _heading(folder: Path) -> str:
+    """Return the table's room, and its settings where they are not the common ones."""
     manifest, config = _manifest(folder), _config(folder)
-    size, seeds = config["data"]["dataset"]["resolution"], len(manifest["seeds"])
-    scene, output = ", ".join(manifest["scenes"]).replace("_", " "), manifest["variant"] or "radiance"
+    size = config["data"]["dataset"]["resolution"]
     images = config["trainer"]["max_steps"] * config["data"]["batch_size"]
-    seen = f"{images:,} images" + (f" x {seeds}" if seeds > 1 else "")
-    width = f"width {config['model']['init_args']['width']}"
-    return f"[{scene}, {size}x{size}, {width}, {output}, {seen}](../results/{folder.name}/claims.md)"
+    rooms = ", ".join(manifest["scenes"]).replace("_", " ")
+    room = rooms.replace("-", " ") if rooms.startswith("real-") else f"built-in {rooms}"
+    settings = [f"{size}x{size}", f"width {config['model']['init_args']['width']}"]
+    settings += [manifest["variant"] or "radiance", f"{images:,} images", f"{len(manifest['seeds'])} trainings"]
+    return f"[{', '.join([room, *(s for s in settings if s not in COMMON)])}](../results/{folder.name}/claims.md)"
 
 
 if __name__ == "__main__":
