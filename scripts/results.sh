@@ -41,8 +41,12 @@ if [ "$scale" = small ]; then
         --out results/builtin_fixed_lights --methods $table2 cnn@direct
     once nlt compare --config table1_real_demodulated --data builtin_fixed_lights --scale small_four_rooms \
         --workers "${WORKERS:-2}" --out results/four_rooms_fixed_lights --methods denoising_1_1 cnn oidn_1 oidn_4 path_tracing_4
+    once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views \
+        --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256 --methods denoising_1_1 cnn oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table2_real_demodulated --data demo --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights --methods $table2 cnn@direct guided_1spp@direct_corrected
+    once nlt compare --config table2_real_demodulated --data demo --seeds 2 --workers "${WORKERS:-2}" \
+        --out results/builtin_moving_lights_seeds --methods nlt_photons nlt cnn feature_projection
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
