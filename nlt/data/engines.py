@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping
 from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from nlt.errors import UserError
@@ -205,14 +206,10 @@ def _on_slurm(work: Work, job: Any) -> UserError | None:
 
 def _work(content: bytes, threads: int, counter: Any) -> None:
     work, job = pickle.loads(content)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
     multiprocessing.current_process().daemon = False  # a daemon may not start processes, as data loaders do
     multiprocessing.set_start_method(None, force=True)  # otherwise data loaders inherit our slow start method
 
     def tick(progress: int) -> None:
-        if not parent.is_alive():
-            os._exit(1)  # the parent was killed, so nobody needs the result
         counter.value += progress
 
     work(job, threads, tick)
@@ -259,4 +256,12 @@ class Process:
 
 
 def _send_result(send: Any, function: Callable, *arguments: Any) -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    Thread(target=_end_after, args=(parent,), daemon=True).start()
     send.send(_result_or_user_error(function, *arguments))
+
+
+def _end_after(parent: Any) -> None:
+    parent.join()
+    os._exit(1)  # it was killed, so nobody needs the result

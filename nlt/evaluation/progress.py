@@ -55,9 +55,6 @@ class Progress(L.Callback):
         if time.monotonic() - self._written > _WRITE:
             self._write(trainer)
 
-    def on_validation_batch_end(self, *_: Any) -> None:
-        self._tick(0)
-
     def on_validation_end(self, trainer: L.Trainer, *_: Any) -> None:
         metrics = {k.removeprefix("val/"): float(v) for k, v in trainer.callback_metrics.items() if k[:4] == "val/"}
         images = images_seen(trainer)
