@@ -46,7 +46,7 @@ if [ "$scale" = small ]; then
         denoising_1_16 denoising_1_32 denoising_1_64 cnn nlt nlt_photons oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table2_real_demodulated --data demo --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights --methods $table2 cnn@direct guided_1spp@direct_corrected
-    once nlt compare --config table2_real_demodulated --data demo --seeds 2 --workers "${WORKERS:-2}" \
+    once nlt compare --config table2_real_demodulated --data demo --seeds 3 --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights_seeds --methods nlt_photons nlt cnn feature_projection
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
