@@ -48,6 +48,10 @@ if [ "$scale" = small ]; then
         --out results/builtin_moving_lights --methods $table2 cnn@direct guided_1spp@direct_corrected
     once nlt compare --config table2_real_demodulated --data demo --seeds 3 --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights_seeds --methods nlt_photons nlt cnn feature_projection
+    once nlt compare --config table2_real_demodulated --data demo --scale medium_few_views \
+        --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256 --methods denoising_1_1 denoising_1_4 \
+        denoising_1_16 denoising_1_32 denoising_1_64 cnn cnn@direct feature_projection nlt nlt_photons oidn_1 oidn_4 \
+        path_tracing_1 path_tracing_4
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
