@@ -1,8 +1,10 @@
-"""Measures whether a method errs over large areas of an image or at its edges and textures (supplementary, Sec. D).
+"""Measures where in an image a method errs.
 
-    python benchmarks/error_spectra.py results/NAME          # after `nlt compare`; writes results/NAME/error_spectra.md
+    python benchmarks/error_spectra.py results/NAME          # after `nlt compare`
 
-It needs the comparison's images and, in --root, its dataset.
+In results/NAME it writes error_spectra.md, whether a method errs over large areas or at edges and textures
+(supplementary, Sec. D), and linear_errors.md, how much of the error in linear radiance lies in mirrors and glass, and
+in few pixels. It needs the comparison's images and, in --root, its dataset.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ from nlt.report.table_writer import grid
 
 WAVELENGTHS = (32, 8)  # pixels, the limits between the bands
 BANDS = ("areas (over 32 pixels)", "shapes (8 to 32)", "edges and textures (below 8)")
+WORST = 0.001  # share of the pixels
+PARTS = ("in mirrors and glass", "MSE elsewhere", "in the worst 0.1 % of pixels")
 
 
 def main() -> None:
@@ -36,34 +40,48 @@ def main() -> None:
     parser.add_argument("directory", type=Path)
     parser.add_argument("--root", type=Path, default=Path("datasets"), help="directory of datasets")
     options = parser.parse_args()
-    text = table(load(options.directory), options.root)
-    write_bytes(options.directory / "error_spectra.md", text.encode())
-    print(text)
+    for name, text in tables(load(options.directory), options.root).items():
+        write_bytes(options.directory / name, text.encode())
+        print(text)
 
 
-def table(results: Results, root: Path) -> str:
-    """Return the error of each method in each band, in Markdown.
+def tables(results: Results, root: Path) -> dict[str, str]:
+    """Return the tables of all methods, in Markdown, by the names of their files.
 
     Raises:
         UserError: the results have no images.
     """
-    reference = results.images("reference")
-    if reference is None:
+    reference, gbuffer = results.images("reference"), results.images("gbuffer")
+    if reference is None or gbuffer is None:
         raise UserError(f"{results.directory}: there are no images; run its nlt compare here")
     directory = root / results.manifest["dataset"]
     views = LightTransportDataset(directory, read_spec(directory), "test", ()).__getitems__(reference["view"].tolist())
-    a, b = (display(views[half], views["exposure"]).numpy() for half in ("reference_a", "reference_b"))
-    rows = []
+    exposure = views["exposure"]
+    halves = views["reference_a"], views["reference_b"]
+    a, b = (display(half, exposure).numpy() for half in halves)
+    dark = (gbuffer["albedo"] == 0).all(1)
+    of_display, of_radiance = [], []
     for method in results.methods:
         images = results.images(method)
         if images:
-            shown = display(torch.from_numpy(images["radiance"]).float(), views["exposure"]).numpy()
-            rows.append([label(method), *cells(spectra(shown, a, b))])
-    note = (
+            radiance = torch.from_numpy(images["radiance"]).float()
+            of_display.append([label(method), *cells(spectra(display(radiance, exposure).numpy(), a, b))])
+            in_a, in_b = (exposure[:, None, None, None] * (radiance - half).double() for half in halves)
+            of_radiance.append([label(method), *linear_cells((in_a * in_b).mean(1).numpy(), dark)])
+    source = f"{len(a)} test views. Source: manifest.json; `python benchmarks/error_spectra.py {results.directory}`"
+    spectra_note = (
         "MSE without the reference's noise, in thousandths, and the shares of wavelengths with standard errors over "
-        f"{len(a)} test views. Source: manifest.json; `python benchmarks/error_spectra.py {results.directory}`"
+        + source
     )
-    return "\n".join(["# Where methods err", "", note, "", *grid(["method", "MSE x 1000", *BANDS], rows)])
+    linear_note = (
+        "MSE without the reference's noise, in radiance times exposure, and the shares of the pixels with the largest "
+        f"error and of mirrors and glass, the {100 * dark.mean():.1f} % of the pixels whose albedo is 0. {source}"
+    )
+    page = lambda title, note, header, rows: "\n".join([f"# {title}", "", note, "", *grid(["method", *header], rows)])
+    return {
+        "error_spectra.md": page("Where methods err", spectra_note, ["MSE x 1000", *BANDS], of_display),
+        "linear_errors.md": page("Where the linear error lies", linear_note, ["unbiased MSE", *PARTS], of_radiance),
+    }
 
 
 def spectra(shown: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -86,6 +104,16 @@ def cells(parts: np.ndarray) -> list[str]:
     errors = [standard_error(column) for column in without.T]
     percent = [f"{100 * share:.0f} ± {100 * error:.0f} %" for share, error in zip(shares(parts), errors, strict=True)]
     return [f"{1000 * parts.sum(1).mean():.2f}", *percent]
+
+
+def linear_cells(errors: np.ndarray, dark: np.ndarray) -> list[str]:
+    """Return a method's MSE, the share of `dark` pixels, the MSE elsewhere, and the share of the worst pixels.
+
+    `errors`, (V, H, W), are squared errors of pixels; `dark`, as large, is true in mirrors and glass.
+    """
+    largest = np.sort(errors, axis=None)[-round(WORST * errors.size) :]
+    shares = [f"{100 * part.sum() / errors.sum():.0f} %" for part in (errors[dark], largest)]
+    return [f"{errors.mean():.5f}", shares[0], f"{errors[~dark].mean():.5f}", shares[1]]
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ import pytest
 
 from nlt.paths import PROJECT
 
-spectra = runpy.run_path(str(PROJECT / "benchmarks/error_spectra.py"))["spectra"]
+script = runpy.run_path(str(PROJECT / "benchmarks/error_spectra.py"))
+spectra, linear_cells = script["spectra"], script["linear_cells"]
 
 
 def noise(seed):
@@ -25,3 +26,11 @@ def test_the_bands_add_up_to_the_mse():
     shown, reference = noise(2), noise(3)
     mse = np.square(shown - reference).mean((1, 2, 3))
     assert spectra(shown, reference, reference).sum(1) == pytest.approx(mse)
+
+
+def test_the_linear_error_of_a_mirror_and_of_few_pixels():
+    errors, mirror = np.full((2, 50, 50), 0.5), np.zeros((2, 50, 50), bool)
+    mirror[0, :10, :10] = True
+    errors[mirror], errors[1, 0, :5] = 20, 400  # 2000 in the mirror, 2000 in a thousandth of the pixels
+    elsewhere = (4895 * 0.5 + 2000) / 4900
+    assert linear_cells(errors, mirror) == [f"{6447.5 / 5000:.5f}", "31 %", f"{elsewhere:.5f}", "31 %"]
