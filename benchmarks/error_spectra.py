@@ -55,11 +55,12 @@ def tables(results: Results, root: Path) -> dict[str, str]:
     if reference is None or gbuffer is None:
         raise UserError(f"{results.directory}: there are no images; run its nlt compare here")
     directory = root / results.manifest["dataset"]
-    views = LightTransportDataset(directory, read_spec(directory), "test", ()).__getitems__(reference["view"].tolist())
+    test = LightTransportDataset(directory, read_spec(directory), "test", ("emission",))
+    views = test.__getitems__(reference["view"].tolist())
     exposure = views["exposure"]
     halves = views["reference_a"], views["reference_b"]
     a, b = (display(half, exposure).numpy() for half in halves)
-    dark = (gbuffer["albedo"] == 0).all(1)
+    dark = (gbuffer["albedo"] == 0).all(1) & (views["emission"].numpy() == 0).all(1)  # lamps have no albedo either
     of_display, of_radiance = [], []
     for method in results.methods:
         images = results.images(method)
@@ -75,7 +76,7 @@ def tables(results: Results, root: Path) -> dict[str, str]:
     )
     linear_note = (
         "MSE without the reference's noise, in radiance times exposure, and the shares of the pixels with the largest "
-        f"error and of mirrors and glass, the {100 * dark.mean():.1f} % of the pixels whose albedo is 0. {source}"
+        f"error and of mirrors and glass, the {100 * dark.mean():.1f} % of the pixels without albedo and lamp. {source}"
     )
     page = lambda title, note, header, rows: "\n".join([f"# {title}", "", note, "", *grid(["method", *header], rows)])
     return {
