@@ -3,8 +3,8 @@
     python benchmarks/error_spectra.py results/NAME          # after `nlt compare`
 
 In results/NAME it writes error_spectra.md, whether a method errs over large areas or at edges and textures
-(supplementary, Sec. D), and linear_errors.md, how much of the error in linear radiance lies in mirrors and glass, and
-in few pixels. It needs the comparison's images and, in --root, its dataset.
+(supplementary, Sec. D), and linear_errors.md, how much of the error in linear radiance lies in mirrors and glass,
+and in pixels brighter than white. It needs the comparison's images and, in --root, its dataset.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from nlt.report.table_writer import grid
 
 WAVELENGTHS = (32, 8)  # pixels, the limits between the bands
 BANDS = ("areas (over 32 pixels)", "shapes (8 to 32)", "edges and textures (below 8)")
-WORST = 0.001  # share of the pixels
-PARTS = ("in mirrors and glass", "MSE elsewhere", "in the worst 0.1 % of pixels")
+PARTS = ("in mirrors and glass", "MSE elsewhere", "brighter than white", "MSE up to white")
 
 
 def main() -> None:
@@ -60,6 +59,8 @@ def tables(results: Results, root: Path) -> dict[str, str]:
     exposure = views["exposure"]
     halves = views["reference_a"], views["reference_b"]
     a, b = (display(half, exposure).numpy() for half in halves)
+    scale = exposure[:, None, None, None]
+    bright = ((halves[0] + halves[1]) / 2 * scale > 1).any(1).numpy()
     dark = (gbuffer["albedo"] == 0).all(1) & (views["emission"].numpy() == 0).all(1)  # lamps have no albedo either
     of_display, of_radiance = [], []
     for method in results.methods:
@@ -67,16 +68,17 @@ def tables(results: Results, root: Path) -> dict[str, str]:
         if images:
             radiance = torch.from_numpy(images["radiance"]).float()
             of_display.append([label(method), *cells(spectra(display(radiance, exposure).numpy(), a, b))])
-            in_a, in_b = (exposure[:, None, None, None] * (radiance - half).double() for half in halves)
-            of_radiance.append([label(method), *linear_cells((in_a * in_b).mean(1).numpy(), dark)])
+            in_a, in_b = (scale * (radiance - half).double() for half in halves)
+            of_radiance.append([label(method), *linear_cells((in_a * in_b).mean(1).numpy(), dark, bright)])
     source = f"{len(a)} test views. Source: manifest.json; `python benchmarks/error_spectra.py {results.directory}`"
     spectra_note = (
         "MSE without the reference's noise, in thousandths, and the shares of wavelengths with standard errors over "
         + source
     )
     linear_note = (
-        "MSE without the reference's noise, in radiance times exposure, and the shares of the pixels with the largest "
-        f"error and of mirrors and glass, the {100 * dark.mean():.1f} % of the pixels without albedo and lamp. {source}"
+        "MSE without the reference's noise, in radiance times exposure, and how much of it lies in mirrors and glass, "
+        f"the {100 * dark.mean():.1f} % of the pixels without albedo and lamp, and in the {100 * bright.mean():.1f} % "
+        f"whose reference is brighter than white. {source}"
     )
     page = lambda title, note, header, rows: "\n".join([f"# {title}", "", note, "", *grid(["method", *header], rows)])
     return {
@@ -107,14 +109,13 @@ def cells(parts: np.ndarray) -> list[str]:
     return [f"{1000 * parts.sum(1).mean():.2f}", *percent]
 
 
-def linear_cells(errors: np.ndarray, dark: np.ndarray) -> list[str]:
-    """Return a method's MSE, the share of `dark` pixels, the MSE elsewhere, and the share of the worst pixels.
+def linear_cells(errors: np.ndarray, *parts: np.ndarray) -> list[str]:
+    """Return a method's MSE and, for each part of the pixels, its share of the error and the MSE outside it.
 
-    `errors`, (V, H, W), are squared errors of pixels; `dark`, as large, is true in mirrors and glass.
+    `errors`, (V, H, W), are squared errors of pixels; a part, as large, is true in its pixels.
     """
-    largest = np.sort(errors, axis=None)[-round(WORST * errors.size) :]
-    shares = [f"{100 * part.sum() / errors.sum():.0f} %" for part in (errors[dark], largest)]
-    return [f"{errors.mean():.5f}", shares[0], f"{errors[~dark].mean():.5f}", shares[1]]
+    of_part = lambda part: [f"{100 * errors[part].sum() / errors.sum():.0f} %", f"{errors[~part].mean():.5f}"]
+    return [f"{errors.mean():.5f}", *(cell for part in parts for cell in of_part(part))]
 
 
 if __name__ == "__main__":

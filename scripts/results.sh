@@ -90,9 +90,10 @@ if [ "$scale" = small ]; then
         --out results/ablation_egg
     once nlt compare --config static_kitchen_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
         --out results/static_kitchen
-    once nlt compare --config static_bathroom_real_demodulated --workers "${WORKERS:-2}" --out results/static_bathroom \
-        --methods cnn@direct feature_projection nlt guided_1spp@direct oidn_1_balanced oidn_1 oidn_4 path_tracing_1 \
-        path_tracing_4 path_tracing_16
+    once nlt compare --config static_bathroom_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
+        --out results/static_bathroom --methods cnn cnn@direct feature_projection nlt oidn_1_balanced oidn_1 oidn_4 \
+        path_tracing_1 path_tracing_4 path_tracing_16
+    once python benchmarks/error_spectra.py results/static_bathroom
     room --config other_rooms --scale medium --out results/other_rooms
     room --config small_images_first --scale medium --out results/small_images_first
     room --config table2_real --out results/real_living_room_radiance \

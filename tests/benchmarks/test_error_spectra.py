@@ -28,9 +28,10 @@ def test_the_bands_add_up_to_the_mse():
     assert spectra(shown, reference, reference).sum(1) == pytest.approx(mse)
 
 
-def test_the_linear_error_of_a_mirror_and_of_few_pixels():
-    errors, mirror = np.full((2, 50, 50), 0.5), np.zeros((2, 50, 50), bool)
-    mirror[0, :10, :10] = True
-    errors[mirror], errors[1, 0, :5] = 20, 400  # 2000 in the mirror, 2000 in a thousandth of the pixels
-    elsewhere = (4895 * 0.5 + 2000) / 4900
-    assert linear_cells(errors, mirror) == [f"{6447.5 / 5000:.5f}", "31 %", f"{elsewhere:.5f}", "31 %"]
+def test_the_linear_error_of_a_mirror_and_of_bright_pixels():
+    errors, mirror, bright = np.full((2, 50, 50), 0.5), np.zeros((2, 50, 50), bool), np.zeros((2, 50, 50), bool)
+    mirror[0, :10, :10] = bright[1, 0, :5] = True
+    errors[mirror], errors[bright] = 20, 400  # 2000 each
+    elsewhere = (4895 * 0.5 + 2000) / 4900, (4895 * 0.5 + 2000) / 4995
+    cells = [f"{6447.5 / 5000:.5f}", "31 %", f"{elsewhere[0]:.5f}", "31 %", f"{elsewhere[1]:.5f}"]
+    assert linear_cells(errors, mirror, bright) == cells
