@@ -45,7 +45,8 @@ if [ "$scale" = small ]; then
         --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256 --methods denoising_1_1 denoising_1_4 \
         denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views --seeds 2 \
-        --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256_seeds --methods feature_projection nlt_photons
+        --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256_seeds --methods feature_projection \
+        nlt_photons nlt cnn
     once nlt compare --config table2_real_demodulated --data demo --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights --methods $table2 cnn@direct guided_1spp@direct_corrected
     once nlt compare --config table2_real_demodulated --data demo --seeds 3 --workers "${WORKERS:-2}" \
