@@ -56,6 +56,9 @@ if [ "$scale" = small ]; then
         denoising_1_16 denoising_1_32 denoising_1_64 cnn cnn@direct feature_projection nlt nlt_photons oidn_1 oidn_4 \
         path_tracing_1 path_tracing_4
     once python benchmarks/error_spectra.py results/builtin_moving_lights_256
+    once nlt compare --config table2_real_demodulated --data demo --scale medium_few_views --seeds 3 \
+        --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256_seeds --methods nlt_photons nlt cnn \
+        feature_projection
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
