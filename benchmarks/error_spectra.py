@@ -3,8 +3,9 @@
     python benchmarks/error_spectra.py results/NAME          # after `nlt compare`
 
 In results/NAME it writes error_spectra.md, whether a method errs over large areas or at edges and textures
-(supplementary, Sec. D), and linear_errors.md, how much of the error in linear radiance lies in mirrors and glass,
-and in pixels brighter than white. It needs the comparison's images and, in --root, its dataset.
+(supplementary, Sec. D), and linear_errors.md, how much of the error in linear radiance lies in pixels without
+albedo (mirrors, glass, black surfaces), and in pixels brighter than white. It needs the comparison's images and, in
+--root, its dataset.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from nlt.report.table_writer import grid
 
 WAVELENGTHS = (32, 8)  # pixels, the limits between the bands
 BANDS = ("areas (over 32 pixels)", "shapes (8 to 32)", "edges and textures (below 8)")
-PARTS = ("in mirrors and glass", "MSE elsewhere", "brighter than white", "MSE up to white")
+PARTS = ("without albedo", "MSE elsewhere", "brighter than white", "MSE up to white")
 
 
 def main() -> None:
@@ -76,9 +77,9 @@ def tables(results: Results, root: Path) -> dict[str, str]:
         + source
     )
     linear_note = (
-        "MSE without the reference's noise, in radiance times exposure, and how much of it lies in mirrors and glass, "
-        f"the {100 * dark.mean():.1f} % of the pixels without albedo and lamp, and in the {100 * bright.mean():.1f} % "
-        f"whose reference is brighter than white. {source}"
+        "MSE without the reference's noise, in radiance times exposure, and how much of it lies in the "
+        f"{100 * dark.mean():.1f} % of the pixels without albedo and lamp (mirrors, glass, black surfaces), and in the "
+        f"{100 * bright.mean():.1f} % whose reference is brighter than white. {source}"
     )
     page = lambda title, note, header, rows: "\n".join([f"# {title}", "", note, "", *grid(["method", *header], rows)])
     return {

@@ -35,6 +35,9 @@ if [ "$scale" = small ]; then
     room --config table2_real_demodulated --scale medium --seeds 3 --out results/real_living_room_256 \
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct
     once python benchmarks/error_spectra.py results/real_living_room_256
+    room --config table2_real_demodulated --scale medium_few_views --out results/real_living_room_256_linear \
+        --methods nlt_photons cnn@direct oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    once python benchmarks/error_spectra.py results/real_living_room_256_linear
     room --config table2_real --scale medium --methods $table2 --out results/real_living_room_256_radiance
     fixed_lights --config table1_real_demodulated --methods guided_1spp $table2 --out results/real_living_room_fixed_lights
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --workers "${WORKERS:-2}" \
