@@ -97,6 +97,9 @@ if [ "$scale" = small ]; then
         --out results/ablation_egg
     once nlt compare --config static_kitchen_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
         --out results/static_kitchen
+    once nlt compare --config static_kitchen_real_demodulated --workers "${WORKERS:-2}" \
+        --out results/static_kitchen_linear --methods nlt feature_projection cnn@direct oidn_4 path_tracing_16
+    once python benchmarks/error_spectra.py results/static_kitchen_linear
     once nlt compare --config static_bathroom_real_demodulated --seeds 3 --workers "${WORKERS:-2}" \
         --out results/static_bathroom --methods cnn cnn@direct feature_projection nlt oidn_1_balanced oidn_1 oidn_4 \
         path_tracing_1 path_tracing_4 path_tracing_16
