@@ -29,6 +29,10 @@ if [ "$scale" = small ]; then
         --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
     once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --workers "${WORKERS:-2}" \
         --out results/real_dining_room --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
+    once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --scale medium_few_views \
+        --workers "${WORKERS:-2}" --out results/real_dining_room_256 --methods denoising_1_1 denoising_1_4 denoising_1_16 \
+        denoising_1_32 denoising_1_64 cnn cnn@direct feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1 path_tracing_4
+    once python benchmarks/error_spectra.py results/real_dining_room_256
     once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
         --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
         nlt_photons guided_1spp guided_1spp@direct_corrected oidn_1 oidn_4
@@ -65,6 +69,9 @@ if [ "$scale" = small ]; then
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
+    once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views \
+        --workers "${WORKERS:-2}" --out results/more_windows --methods cnn cnn@windows_12800 feature_projection \
+        feature_projection@windows_12800 nlt nlt@windows_12800 nlt_photons nlt_photons@windows_12800
     room --config windows --scale pretrained --out results/windows_128 \
         --methods cnn cnn@windows_128 photons_only photons_only@windows_128
     once nlt compare --config front --data demo --scale medium --seeds 3 --workers "${WORKERS:-2}" \
