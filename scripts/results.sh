@@ -18,7 +18,8 @@ room() {
 fixed_lights() {
     once nlt compare --data real_living_room_fixed_lights --workers "${WORKERS:-2}" "$@"
 }
-table2="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons
+denoising="denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64"
+table2="$denoising cnn feature_projection nlt nlt_photons
     oidn_1_fast oidn_1_balanced oidn_1 oidn_4 path_tracing_1 path_tracing_4"
 peers="oidn_1_fast oidn_1_balanced oidn_1 oidn_2_fast oidn_2_balanced oidn_2 oidn_4_fast oidn_4_balanced oidn_4"
 front="cnn@direct cnn@direct_patches guided_1spp@direct guided_1spp_1_4@direct guided_1spp_1_4@direct_patches guided_4spp@direct
@@ -30,8 +31,8 @@ if [ "$scale" = small ]; then
     once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --workers "${WORKERS:-2}" \
         --out results/real_dining_room --methods $table2 cnn@direct guided_1spp guided_1spp@direct_corrected
     once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --scale medium_few_views \
-        --workers "${WORKERS:-2}" --out results/real_dining_room_256 --methods denoising_1_1 denoising_1_4 denoising_1_16 \
-        denoising_1_32 denoising_1_64 cnn cnn@direct feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1 path_tracing_4
+        --workers "${WORKERS:-2}" --out results/real_dining_room_256 --methods $denoising cnn cnn@direct \
+        feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once python benchmarks/error_spectra.py results/real_dining_room_256
     once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
         --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
@@ -49,8 +50,8 @@ if [ "$scale" = small ]; then
     once nlt compare --config table1_real_demodulated --data builtin_fixed_lights --scale small_four_rooms \
         --workers "${WORKERS:-2}" --out results/four_rooms_fixed_lights --methods denoising_1_1 cnn oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views \
-        --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256 --methods denoising_1_1 denoising_1_4 \
-        denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_4
+        --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256 --methods $denoising cnn \
+        feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views --seeds 2 \
         --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256_seeds --methods feature_projection \
         nlt_photons nlt cnn
@@ -59,9 +60,8 @@ if [ "$scale" = small ]; then
     once nlt compare --config table2_real_demodulated --data demo --seeds 3 --workers "${WORKERS:-2}" \
         --out results/builtin_moving_lights_seeds --methods nlt_photons nlt cnn feature_projection
     once nlt compare --config table2_real_demodulated --data demo --scale medium_few_views \
-        --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256 --methods denoising_1_1 denoising_1_4 \
-        denoising_1_16 denoising_1_32 denoising_1_64 cnn cnn@direct feature_projection nlt nlt_photons oidn_1 oidn_4 \
-        path_tracing_1 path_tracing_4
+        --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256 --methods $denoising cnn cnn@direct \
+        feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once python benchmarks/error_spectra.py results/builtin_moving_lights_256
     once nlt compare --config table2_real_demodulated --data demo --scale medium_few_views --seeds 3 \
         --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256_seeds --methods nlt_photons nlt cnn \
@@ -116,13 +116,12 @@ if [ "$scale" = small ]; then
     room --config table2_real --out results/real_living_room_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
 fi
+# shellcheck disable=SC2086  # a list of methods
 if [ "$scale" = gpu ]; then
     room --config table2_real --scale gpu_256 --workers 14 --seeds 2 --out results/real_living_room_256_gpu \
-        --methods denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt \
-        nlt_photons path_tracing_1 path_tracing_4
+        --methods $denoising cnn feature_projection nlt nlt_photons path_tracing_1 path_tracing_4
     room --config table2_real --scale gpu_256_9600 --workers 9 --out results/real_living_room_256_gpu_9600 \
-        --methods denoising_1_1 denoising_1_4 denoising_1_16 denoising_1_32 denoising_1_64 cnn feature_projection nlt \
-        nlt_photons path_tracing_1
+        --methods $denoising cnn feature_projection nlt nlt_photons path_tracing_1
     room --config table2_real_demodulated --scale gpu_256 --workers 2 --out results/real_living_room_256_gpu_direct \
         --methods guided_1spp@direct cnn@direct
 fi
