@@ -1,6 +1,7 @@
 """Prints the verdicts on the paper's claims by scale: `python scripts/claims.py`.
 
-A row per claim, a column per folder of results/ whose methods were trained with the recipe's learning rate.
+A row per claim, a column per folder of results/ whose methods were trained with the recipe's learning rate; built-in
+and real rooms have tables of their own.
 """
 
 import json
@@ -18,16 +19,19 @@ RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
 def tables() -> str:
-    """Return a table for each of the paper's tables, in Markdown."""
+    """Return two tables, of built-in and of real rooms, for each of the paper's tables, in Markdown."""
     text = []
     for table in paper.tables():
-        folders = [folder for folder in sorted(RESULTS.iterdir()) if _is_current(folder, table) and _verdicts(folder)]
-        verdicts = {folder: _verdicts(folder) for folder in folders}
         claims = [claim["id"] for claim in claims_of(table)]
-        rows = [[claim, *(verdicts[folder].get(claim, "") for folder in folders)] for claim in claims]
-        holding = [f"{sum('holds' in v for v in verdicts[f].values())} of {len(verdicts[f])}" for f in folders]
-        rows.append(["**hold**", *holding])
-        text += grid([f"Claims: {paper.paper()[table]['title']}", *map(_heading, folders)], rows, numbers=False)
+        for kind in "built-in", "real":
+            verdicts = {_heading(f): _verdicts(f) for f in sorted(RESULTS.iterdir()) if _is_current(f, table, kind)}
+            verdicts = {heading: found for heading, found in verdicts.items() if found}
+            if not verdicts:
+                continue
+            rows = [[claim, *(found.get(claim, "") for found in verdicts.values())] for claim in claims]
+            holding = [f"{sum('holds' in v for v in found.values())} of {len(found)}" for found in verdicts.values()]
+            rows.append(["**hold**", *holding])
+            text += grid([f"{paper.paper()[table]['title']}: {kind} rooms", *verdicts], rows, numbers=False)
     return "\n".join(text).strip()
 
 
@@ -35,13 +39,20 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "manifest.json").read_text())  # type: ignore[no-any-return]
 
 
+def _rooms(folder: Path) -> str:
+    rooms = ", ".join(_manifest(folder)["scenes"]).replace("_", " ")
+    return rooms.replace("-", " ") if rooms.startswith("real-") else f"built-in {rooms}"
+
+
 def _config(folder: Path) -> dict[str, Any]:
     """Return the config of one method; the settings read here are those of all of them."""
     return next(config for config in _manifest(folder)["configs"].values() if "trainer" in config)
 
 
-def _is_current(folder: Path, table: str) -> bool:
+def _is_current(folder: Path, table: str, kind: str) -> bool:
     if not (folder / "claims.md").exists() or _manifest(folder)["table"] != table:
+        return False
+    if _rooms(folder).startswith("real") != (kind == "real"):
         return False
     return bool(_config(folder)["model"]["init_args"].get("lr_schedule") == "cosine")
 
@@ -58,11 +69,10 @@ def _heading(folder: Path) -> str:
     manifest, config = _manifest(folder), _config(folder)
     size = config["data"]["dataset"]["resolution"]
     images = config["trainer"]["max_steps"] * config["data"]["batch_size"]
-    rooms = ", ".join(manifest["scenes"]).replace("_", " ")
-    room = rooms.replace("-", " ") if rooms.startswith("real-") else f"built-in {rooms}"
     settings = [f"{size}x{size}", f"width {config['model']['init_args']['width']}"]
     settings += [manifest["variant"] or "radiance", f"{images:,} images", f"{len(manifest['seeds'])} trainings"]
-    return f"[{', '.join([room, *(s for s in settings if s not in COMMON)])}](../results/{folder.name}/claims.md)"
+    words = [_rooms(folder), *(s for s in settings if s not in COMMON)]
+    return f"[{', '.join(words)}](../results/{folder.name}/claims.md)"
 
 
 if __name__ == "__main__":
