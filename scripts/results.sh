@@ -68,6 +68,9 @@ if [ "$scale" = small ]; then
     once nlt compare --config table2_real_demodulated --data demo --scale medium_few_views --seeds 3 \
         --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256_seeds --methods nlt_photons nlt cnn \
         feature_projection
+    once nlt compare --config table2_real_demodulated --data demo --scale medium_6400 --workers "${WORKERS:-2}" \
+        --out results/builtin_moving_lights_256_6400 --methods nlt_photons nlt cnn feature_projection denoising_1_64 \
+        path_tracing_1
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
