@@ -19,7 +19,7 @@ RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
 def tables() -> str:
-    """Return two tables, of built-in and of real rooms, for each of the paper's tables, in Markdown."""
+    """Return a table of built-in and one of real rooms for each of the paper's tables, in Markdown."""
     text = []
     for table in paper.tables():
         claims = [claim["id"] for claim in claims_of(table)]
@@ -50,9 +50,10 @@ def _config(folder: Path) -> dict[str, Any]:
 
 
 def _is_current(folder: Path, table: str, kind: str) -> bool:
+    """Tell whether a folder has a paper's table, in rooms of a kind ("built-in" or "real") and by the recipe."""
     if not (folder / "claims.md").exists() or _manifest(folder)["table"] != table:
         return False
-    if _rooms(folder).startswith("real") != (kind == "real"):
+    if not _rooms(folder).startswith(kind):
         return False
     return bool(_config(folder)["model"]["init_args"].get("lr_schedule") == "cosine")
 
