@@ -51,7 +51,7 @@ if [ "$scale" = small ]; then
         --out results/builtin_fixed_lights --methods $table2 cnn@direct
     once nlt compare --config table1_real_demodulated --data builtin_fixed_lights --scale small_four_rooms \
         --workers "${WORKERS:-2}" --out results/four_rooms_fixed_lights --methods denoising_1_1 cnn oidn_1 oidn_4 path_tracing_4
-    once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views \
+    once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_64_views \
         --workers "${WORKERS:-2}" --out results/builtin_fixed_lights_256 --methods $denoising cnn \
         feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_4
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --scale medium_few_views --seeds 2 \
@@ -69,8 +69,8 @@ if [ "$scale" = small ]; then
         --workers "${WORKERS:-2}" --out results/builtin_moving_lights_256_seeds --methods nlt_photons nlt cnn \
         feature_projection
     once nlt compare --config table2_real_demodulated --data demo --scale medium_6400 --workers "${WORKERS:-2}" \
-        --out results/builtin_moving_lights_256_6400 --methods nlt_photons nlt cnn feature_projection denoising_1_64 \
-        path_tracing_1
+        --out results/builtin_moving_lights_256_6400 --methods $denoising cnn feature_projection nlt nlt_photons oidn_1 \
+        oidn_4 path_tracing_1 path_tracing_4
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
