@@ -34,6 +34,9 @@ if [ "$scale" = small ]; then
         --workers "${WORKERS:-2}" --out results/real_dining_room_256 --methods $denoising cnn cnn@direct \
         feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1 path_tracing_4
     once python benchmarks/error_spectra.py results/real_dining_room_256
+    once nlt compare --config table2_real_demodulated --data real_dining_room_moving_lights --scale medium_few_views \
+        --seeds 3 --workers "${WORKERS:-2}" --out results/real_dining_room_256_seeds --methods nlt_photons nlt cnn \
+        feature_projection
     once nlt stress --config table2_real_demodulated --data real_living_room_moving_lights --out results/real_living_room \
         --suites light geometry materials camera budget frame flicker --methods cnn cnn@direct feature_projection nlt \
         nlt_photons guided_1spp guided_1spp@direct_corrected oidn_1 oidn_4
