@@ -14,7 +14,8 @@ from nlt.evaluation.claims import claims_of
 from nlt.report.claims import BELOW_FLOOR
 from nlt.report.table_writer import grid
 
-COMMON = {"64x64", "width 16", "demodulated", "25,600 images", "1 trainings"}  # docs/paper-tables.md names them
+# docs/paper-tables.md names them.
+COMMON = {"64x64", "width 16", "demodulated", "25,600 images", "1 trainings", "64 test views"}
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
@@ -72,6 +73,7 @@ def _heading(folder: Path) -> str:
     images = config["trainer"]["max_steps"] * config["data"]["batch_size"]
     settings = [f"{size}x{size}", f"width {config['model']['init_args']['width']}"]
     settings += [manifest["variant"] or "radiance", f"{images:,} images", f"{len(manifest['seeds'])} trainings"]
+    settings.append(f"{manifest['n_test']} test views")
     words = [_rooms(folder), *(s for s in settings if s not in COMMON)]
     return f"[{', '.join(words)}](../results/{folder.name}/claims.md)"
 
