@@ -72,8 +72,8 @@ def _heading(folder: Path) -> str:
     size = config["data"]["dataset"]["resolution"]
     images = config["trainer"]["max_steps"] * config["data"]["batch_size"]
     settings = [f"{size}x{size}", f"width {config['model']['init_args']['width']}"]
-    settings += [manifest["variant"] or "radiance", f"{images:,} images", f"{len(manifest['seeds'])} trainings"]
-    settings.append(f"{manifest['n_test']} test views")
+    settings += [manifest["variant"] or "radiance", f"{images:,} images"]
+    settings += [f"{len(manifest['seeds'])} trainings", f"{manifest['n_test']} test views"]
     words = [_rooms(folder), *(s for s in settings if s not in COMMON)]
     return f"[{', '.join(words)}](../results/{folder.name}/claims.md)"
 
