@@ -80,6 +80,8 @@ if [ "$scale" = small ]; then
         --out results/builtin_moving_lights_256_6400 --methods $denoising cnn feature_projection nlt nlt_photons oidn_1 \
         oidn_4 path_tracing_1 path_tracing_4
     once python benchmarks/error_spectra.py results/builtin_moving_lights_256_6400
+    once nlt compare --config table2_real_demodulated --data demo --scale medium_25600 --workers "${WORKERS:-2}" \
+        --out results/builtin_moving_lights_256_25600 --methods nlt_photons nlt feature_projection cnn path_tracing_1
     fixed_lights --config table1_real --out results/real_living_room_fixed_lights_radiance \
         --methods cnn feature_projection nlt nlt_photons oidn_1 oidn_4 path_tracing_1
     room --config windows --scale medium --out results/windows
