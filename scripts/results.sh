@@ -58,6 +58,9 @@ if [ "$scale" = small ]; then
         path_tracing_1 path_tracing_4
     once python scripts/teaser.py results/real_dining_room_fixed_lights_256 --view 3 -o docs/sun.webp \
         --methods path_tracing_1 nlt_photons cnn@direct_clean_target guided_1spp@direct_clean_target oidn_1 oidn_4
+    once nlt compare --config table1_real_demodulated --data real_dining_room_fixed_lights --scale medium_sky \
+        --workers "${WORKERS:-2}" --out results/clean_target --methods cnn cnn@clean_target nlt_photons \
+        nlt_photons@clean_target nlt_photons@decayed_embedding photons_only oidn_1
     once nlt compare --config table1_real_demodulated --data demo_fixed_lights --workers "${WORKERS:-2}" \
         --out results/builtin_fixed_lights --methods $table2 cnn@direct
     once nlt compare --config table1_real_demodulated --data builtin_fixed_lights --scale small_four_rooms \
